@@ -1,0 +1,1 @@
+"""MABL: sample-efficient multi-agent reinforcement learning with bi-level world models."""

@@ -1,0 +1,1 @@
+"""Algorithms: compositions of a world model and a way to learn behaviour."""

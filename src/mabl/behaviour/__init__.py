@@ -1,0 +1,1 @@
+"""How agents act and learn to act (section 3.3)."""

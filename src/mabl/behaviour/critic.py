@@ -1,0 +1,29 @@
+"""The shared centralised critic, with self-attention over agents (section 3.3, [39])."""
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+from mabl.nets.attention import SelfAttention
+from mabl.nets.mlp import MLP, Linear
+from mabl.types import PRNGKey
+
+
+class Critic(eqx.Module):
+    """V(z_agent, z_global, h_agent, h_global) of each agent, attending to all agents."""
+
+    embed: Linear
+    attention: SelfAttention
+    mlp: MLP
+
+    def __init__(self, n_features: int, hidden: int, n_hidden: int, n_heads: int, key: PRNGKey):
+        key_embed, key_attention, key_mlp = jax.random.split(key, 3)
+        self.embed = Linear(n_features, hidden, key_embed)
+        self.attention = SelfAttention(hidden, n_heads, key_attention)
+        self.mlp = MLP(hidden, 1, hidden, n_hidden, key_mlp)
+
+    def __call__(self, features: Float[Array, "N G"]) -> Float[Array, " N"]:
+        """One value for each agent of a team."""
+        x = jax.nn.relu(jax.vmap(self.embed)(features))
+        x = x + self.attention(x)
+        return jax.vmap(self.mlp)(x)[:, 0]

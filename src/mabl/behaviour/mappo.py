@@ -1,0 +1,242 @@
+"""Multi-agent PPO on latent trajectories (section 3.3, Table 3, [46])."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from einops import rearrange
+from jaxtyping import Array, Float
+
+from mabl.behaviour.actor import Actor
+from mabl.behaviour.critic import Critic
+from mabl.losses.ppo import clipped_surrogate
+from mabl.losses.returns import lambda_returns
+from mabl.types import Metrics, PRNGKey, Trajectory
+
+
+@dataclass(frozen=True)
+class MAPPOConfig:
+    """Actor, critic and PPO. Defaults are the paper's (Tables 3 and 4)."""
+
+    hidden: int = 256
+    """Width of actor and critic."""
+    n_hidden: int = 2
+    """Hidden layers of actor and critic."""
+    n_heads: int = 8
+    """Heads of the critic's self-attention over agents."""
+    actor_out_scale: float = 1.0
+    """Scale of the actor's last layer at the start; 0.01 starts with a uniform policy."""
+    actor_learning_rate: float = 1e-4
+    """Adam's learning rate for the actor."""
+    critic_learning_rate: float = 1e-3
+    """Adam's learning rate for the critic."""
+    actor_weight_decay: float = 1e-5
+    """L2 penalty on the actor's weights, through the gradient."""
+    grad_clip: float = 100.0
+    """Largest global norm of actor's and critic's gradients."""
+    gamma: float = 0.99
+    """Discount factor."""
+    gae_lambda: float = 0.95
+    """Lambda of the returns."""
+    clip: float = 0.2
+    """PPO's clipping range of the probability ratio."""
+    n_epochs: int = 5
+    """Passes over the imagined rows in one policy update."""
+    batch_size: int = 2000
+    """Joint rows in a PPO minibatch."""
+    ent_coef: float = 0.001
+    """Entropy bonus at the start."""
+    ent_decay: float = 0.99998
+    """Factor on the entropy bonus after every minibatch."""
+    value_coef: float = 0.5
+    """Factor on the critic's squared error."""
+    normalise_advantage: bool = True
+    """Give advantages zero mean and unit variance over the imagined rows."""
+    team_reward: bool = True
+    """Average predicted rewards over agents (SMAC, MAMuJoCo)."""
+    horizon: int = 15
+    """Rows of an imagined trajectory, the start included."""
+    n_starts: int | None = None
+    """Start states drawn from the posterior states of a batch; None: all, as in the paper."""
+
+
+class MAPPO(NamedTuple):
+    """Everything that learning to act changes."""
+
+    actor: Actor
+    critic: Critic
+    actor_opt: optax.OptState
+    critic_opt: optax.OptState
+    ent_coef: Float[Array, ""]
+
+
+class PPORows(NamedTuple):
+    """Joint rows of imagined experience, `[M, N, ...]`, as PPO's epochs see them."""
+
+    actor_features: Array
+    critic_features: Array
+    available: Array
+    action: Array
+    log_prob: Array
+    advantage: Array
+    target: Array
+    weight: Array
+
+
+def optimisers(
+    config: MAPPOConfig,
+) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
+    """Adam for the actor (with weight decay) and the critic, behind gradient clipping."""
+    actor = optax.chain(
+        optax.clip_by_global_norm(config.grad_clip),
+        optax.add_decayed_weights(config.actor_weight_decay),
+        optax.adam(config.actor_learning_rate),
+    )
+    critic = optax.chain(
+        optax.clip_by_global_norm(config.grad_clip), optax.adam(config.critic_learning_rate)
+    )
+    return actor, critic
+
+
+def init(
+    config: MAPPOConfig, n_actor: int, n_critic: int, n_actions: int, key: PRNGKey
+) -> MAPPO:
+    """Fresh networks for features of sizes F = `n_actor` and G = `n_critic`."""
+    key_actor, key_critic = jax.random.split(key)
+    actor = Actor(
+        n_actor, n_actions, config.hidden, config.n_hidden, config.actor_out_scale, key_actor
+    )
+    critic = Critic(n_critic, config.hidden, config.n_hidden, config.n_heads, key_critic)
+    actor_optimiser, critic_optimiser = optimisers(config)
+    return MAPPO(
+        actor=actor,
+        critic=critic,
+        actor_opt=actor_optimiser.init(eqx.filter(actor, eqx.is_array)),
+        critic_opt=critic_optimiser.init(eqx.filter(critic, eqx.is_array)),
+        ent_coef=jnp.float32(config.ent_coef),
+    )
+
+
+def experience(
+    critic: Critic, trajectory: Trajectory, start_weight: Float[Array, " B"], config: MAPPOConfig
+) -> tuple[PPORows, Metrics]:
+    """Lambda-returns and advantages of imagined trajectories, flattened to joint rows.
+
+    A row weighs as much as the model believes that the episode reaches it.
+    """
+    reward = trajectory.reward
+    if config.team_reward:
+        reward = jnp.broadcast_to(reward.mean(-1, keepdims=True), reward.shape)
+    value = jax.vmap(jax.vmap(critic))(trajectory.critic_features)
+    target = lambda_returns(
+        reward, config.gamma * trajectory.continues, value[1:], config.gae_lambda
+    )
+    reached = jnp.cumprod(
+        jnp.concatenate(
+            [
+                jnp.broadcast_to(start_weight[:, None], trajectory.continues[:1].shape[1:])[None],
+                trajectory.continues[:-1],
+            ]
+        ),
+        axis=0,
+    )
+    advantage = target - value[:-1]
+    metrics = {
+        "behaviour/imagined_reward": (reached * reward).sum() / reached.sum(),
+        "behaviour/imagined_return": (start_weight * target[0].mean(-1)).sum()
+        / start_weight.sum(),
+        "behaviour/value": (reached * value[:-1]).sum() / reached.sum(),
+        "behaviour/advantage_std": advantage.std(),
+    }
+    if config.normalise_advantage:
+        mean = (reached * advantage).sum() / reached.sum()
+        variance = (reached * (advantage - mean) ** 2).sum() / reached.sum()
+        advantage = (advantage - mean) / (jnp.sqrt(variance) + 1e-5)
+    rows = PPORows(
+        trajectory.actor_features[:-1],
+        trajectory.critic_features[:-1],
+        trajectory.available[:-1],
+        trajectory.action,
+        trajectory.log_prob,
+        advantage,
+        target,
+        reached,
+    )
+    return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
+
+
+def actor_loss(
+    actor: Actor, rows: PPORows, ent_coef: Float[Array, ""], clip: float
+) -> tuple[Float[Array, ""], Metrics]:
+    """PPO's clipped surrogate minus the entropy bonus."""
+    policy = jax.vmap(jax.vmap(actor))(rows.actor_features, rows.available)
+    log_prob = policy.log_prob(rows.action)
+    surrogate = clipped_surrogate(log_prob, rows.log_prob, rows.advantage, clip)
+    total = rows.weight.sum() + 1e-8
+    entropy = (rows.weight * policy.entropy()).sum() / total
+    loss = (rows.weight * surrogate).sum() / total - ent_coef * entropy
+    ratio = jnp.exp(log_prob - rows.log_prob)
+    return loss, {
+        "behaviour/actor_loss": loss,
+        "behaviour/entropy": entropy,
+        "behaviour/clip_fraction": (rows.weight * (jnp.abs(ratio - 1) > clip)).sum() / total,
+        "behaviour/approx_kl": (rows.weight * (rows.log_prob - log_prob)).sum() / total,
+    }
+
+
+def critic_loss(
+    critic: Critic, rows: PPORows, value_coef: float
+) -> tuple[Float[Array, ""], Metrics]:
+    """`value_coef` times the squared error to the lambda-returns."""
+    error = jax.vmap(critic)(rows.critic_features) - rows.target
+    loss = value_coef * (rows.weight * error**2).sum() / (rows.weight.sum() + 1e-8)
+    return loss, {"behaviour/critic_loss": loss}
+
+
+def update(
+    mappo: MAPPO,
+    trajectory: Trajectory,
+    start_weight: Float[Array, " B"],
+    key: PRNGKey,
+    config: MAPPOConfig,
+) -> tuple[MAPPO, Metrics]:
+    """`n_epochs` of minibatch PPO on one set of imagined trajectories (Algorithm 1, lines 12-13).
+
+    `start_weight` is 0 for starts that must not count (terminal rows), else 1.
+    """
+    rows, metrics = experience(mappo.critic, trajectory, start_weight, config)
+    n_rows = rows.target.shape[0]
+    batch_size = min(config.batch_size, n_rows)
+    n_batches = n_rows // batch_size
+    actor_optimiser, critic_optimiser = optimisers(config)
+
+    def minibatch(mappo: MAPPO, index: Array) -> tuple[MAPPO, Metrics]:
+        batch = jax.tree.map(lambda x: x[index], rows)
+        actor_grad, actor_metrics = eqx.filter_grad(actor_loss, has_aux=True)(
+            mappo.actor, batch, mappo.ent_coef, config.clip
+        )
+        critic_grad, critic_metrics = eqx.filter_grad(critic_loss, has_aux=True)(
+            mappo.critic, batch, config.value_coef
+        )
+        actor_step, actor_opt = actor_optimiser.update(actor_grad, mappo.actor_opt, mappo.actor)  # pyright: ignore[reportArgumentType]
+        critic_step, critic_opt = critic_optimiser.update(critic_grad, mappo.critic_opt)
+        mappo = MAPPO(
+            actor=eqx.apply_updates(mappo.actor, actor_step),
+            critic=eqx.apply_updates(mappo.critic, critic_step),
+            actor_opt=actor_opt,
+            critic_opt=critic_opt,
+            ent_coef=mappo.ent_coef * config.ent_decay,
+        )
+        return mappo, actor_metrics | critic_metrics
+
+    def shuffled(key: PRNGKey) -> Array:
+        order = jax.random.permutation(key, n_rows)[: n_batches * batch_size]
+        return rearrange(order, "(m b) -> m b", m=n_batches)
+
+    batches = jax.vmap(shuffled)(jax.random.split(key, config.n_epochs))
+    batches = rearrange(batches, "e m b -> (e m) b")
+    mappo, history = jax.lax.scan(minibatch, mappo, batches)
+    return mappo, metrics | jax.tree.map(jnp.mean, history) | {"behaviour/ent_coef": mappo.ent_coef}

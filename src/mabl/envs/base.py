@@ -1,0 +1,88 @@
+"""What an environment is to the rest of the house."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import jax
+from jaxtyping import Array, Float, Shaped
+
+from mabl.types import PRNGKey, TimeStep
+
+EnvState = Any
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """Actions 0 .. n-1, one int32 per agent."""
+
+    n: int
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one agent's action."""
+        return ()
+
+    @property
+    def size(self) -> int:
+        """Length of an encoded action, A."""
+        return self.n
+
+    def encode(self, action: Shaped[Array, "*b"]) -> Float[Array, "*b A"]:
+        """One-hot vectors: what networks see of an action."""
+        return jax.nn.one_hot(action, self.n)
+
+
+@dataclass(frozen=True)
+class Continuous:
+    """Vectors of length `size` in [-1, 1]; the adapter rescales to the environment's own bounds."""
+
+    size: int
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one agent's action."""
+        return (self.size,)
+
+    def encode(self, action: Float[Array, "*b A"]) -> Float[Array, "*b A"]:
+        """The action itself."""
+        return action
+
+
+ActionSpace = Discrete | Continuous
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """Sizes and names of an environment, known before it runs."""
+
+    name: str
+    n_agents: int
+    obs_dim: int
+    state_dim: int
+    action_space: ActionSpace
+    episode_limit: int
+    """Joint steps after which an episode is truncated."""
+    score_name: str
+    """What `TimeStep.score` means, e.g. `win_rate`: its mean over episodes is logged so."""
+
+
+class CompiledEnv(Protocol):
+    """A pure environment that runs inside jit. It never resets itself.
+
+    Rows that it returns have no leading axes; callers vmap over environments.
+    """
+
+    @property
+    def spec(self) -> EnvSpec:
+        """Sizes and names."""
+        ...
+
+    def reset(self, key: PRNGKey) -> tuple[EnvState, TimeStep]:
+        """Start an episode; the row has `is_first` set, zero `prev_action` and zero reward."""
+        ...
+
+    def step(
+        self, key: PRNGKey, env_state: EnvState, action: Shaped[Array, "N ..."]
+    ) -> tuple[EnvState, TimeStep]:
+        """Take one joint step. Undefined after a row for which `is_last` holds."""
+        ...

@@ -1,0 +1,27 @@
+"""Lambda-returns along imagined or real trajectories."""
+
+import jax
+from jaxtyping import Array, Float
+
+
+def lambda_returns(
+    reward: Float[Array, "T *b"],
+    discount: Float[Array, "T *b"],
+    next_value: Float[Array, "T *b"],
+    gae_lambda: float,
+) -> Float[Array, "T *b"]:
+    """G_t = r_{t+1} + d_{t+1} ((1 - lambda) V_{t+1} + lambda G_{t+1}), with G = V past the end.
+
+    Row t of every argument belongs to the transition from t to t + 1: the reward received on
+    arriving, the discount gamma * (1 - terminated) of going on, the value of where it arrived.
+    """
+
+    def backward(later: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        reward, discount, value = row
+        now = reward + discount * ((1 - gae_lambda) * value + gae_lambda * later)
+        return now, now
+
+    _, returns = jax.lax.scan(
+        backward, next_value[-1], (reward, discount, next_value), reverse=True
+    )
+    return returns

@@ -1,0 +1,75 @@
+"""The model buffer D: the last rows of each environment, sampled as uniform sequences.
+
+Functions are written for one lane (one environment's rows, contiguous in time) and one call; the
+caller vmaps over lanes. All of it lives on the device and inside the compiled training cycle.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from mabl.errors import UserError
+from mabl.types import PRNGKey, TimeStep
+
+
+class Replay(NamedTuple):
+    """A ring of rows; `[C, ...]` for one lane, `[E, C, ...]` for all."""
+
+    rows: TimeStep
+    cursor: Int[Array, "*e"]
+    """Where the next row goes."""
+    size: Int[Array, "*e"]
+    """Rows held."""
+
+
+def empty(row: TimeStep, capacity: int) -> Replay:
+    """A lane for `capacity` rows shaped like `row`."""
+    rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), row)
+    return Replay(rows, cursor=jnp.int32(0), size=jnp.int32(0))
+
+
+def add(replay: Replay, rows: TimeStep, count: Int[Array, ""]) -> Replay:
+    """Append the first `count` of `rows` `[R, ...]`, overwriting the oldest."""
+    capacity = replay.rows.reward.shape[0]
+    offset = jnp.arange(rows.reward.shape[0])
+    # Rows past `count` are sent out of bounds, where the scatter drops them.
+    index = jnp.where(offset < count, (replay.cursor + offset) % capacity, capacity)
+    return Replay(
+        rows=jax.tree.map(lambda old, new: old.at[index].set(new, mode="drop"), replay.rows, rows),
+        cursor=(replay.cursor + count) % capacity,
+        size=jnp.minimum(replay.size + count, capacity),
+    )
+
+
+def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int) -> TimeStep:
+    """Draw `[B, T, ...]` uniformly from all runs of `length` rows, over all lanes `[E, C, ...]`.
+
+    Sequences cross episode boundaries (`is_first` marks them) but never the ring's seam. Some lane
+    must hold at least `length` rows.
+    """
+    capacity = replay.rows.reward.shape[1]
+    starts = jnp.maximum(replay.size - length + 1, 0)
+    ends = jnp.cumsum(starts)
+    pick = jax.random.randint(key, (batch_size,), 0, ends[-1])
+    lane = jnp.searchsorted(ends, pick, side="right")
+    age = pick - (ends - starts)[lane]
+    oldest = (replay.cursor - replay.size)[lane]
+    index = (oldest[:, None] + age[:, None] + jnp.arange(length)) % capacity
+    return jax.tree.map(lambda x: x[lane[:, None], index], replay.rows)
+
+
+def nbytes(row: TimeStep, capacity: int) -> int:
+    """Memory in bytes that `capacity` rows shaped like `row` take."""
+    return capacity * sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(row))
+
+
+def check_memory(needed: int, free: int | None) -> None:
+    """Raise UserError if `needed` bytes exceed the `free` bytes (None: unknown, no check)."""
+    if free is not None and needed > free:
+        raise UserError(
+            f"the replay needs {needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: "
+            "lower --training.replay-capacity, --training.num-envs or --num-seeds"
+        )

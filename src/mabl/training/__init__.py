@@ -1,0 +1,1 @@
+"""Training runs: the loop, their folders, their checkpoints and what they show."""

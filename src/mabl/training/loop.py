@@ -1,0 +1,139 @@
+"""Algorithm 1 of the paper as a pure function of (config, key): one cycle is one compiled program."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from mabl import replay as replays
+from mabl.algorithms.model_based import Learner, ModelBased
+from mabl.envs.base import CompiledEnv
+from mabl.replay import Replay
+from mabl.rollout import Collector, Rollout, rollout, start
+from mabl.types import Metrics, PRNGKey
+
+
+class TrainState(NamedTuple):
+    """Everything that decides the future of a run."""
+
+    learner: Learner
+    replay: Replay
+    collectors: Collector
+    key: PRNGKey
+    env_steps: Int[Array, ""]
+    cycles: Int[Array, ""]
+    model_updates: Int[Array, ""]
+    policy_updates: Int[Array, ""]
+
+
+class Training(NamedTuple):
+    """An algorithm in an environment, ready to run."""
+
+    env: CompiledEnv
+    algorithm: ModelBased
+
+    def init(self, key: PRNGKey) -> TrainState:
+        """Line 1: initialise actor, critic, model and the model buffer."""
+        config = self.algorithm.config.training
+        key, key_learner, key_envs = jax.random.split(key, 3)
+        learner = self.algorithm.init(key_learner)
+        executor = self.algorithm.executor(learner)
+        collectors = jax.vmap(lambda key: start(self.env, executor, key))(
+            jax.random.split(key_envs, config.num_envs)
+        )
+        capacity = config.replay_capacity // config.num_envs
+        replay = jax.vmap(lambda row: replays.empty(row, capacity))(collectors.row)
+        return TrainState(learner, replay, collectors, key, *[jnp.int32(0)] * 4)
+
+    def cycle(
+        self, state: TrainState, n_model: Int[Array, ""], n_policy: Int[Array, ""]
+    ) -> tuple[TrainState, Metrics]:
+        """Lines 3-14: collect, store, `n_model` model updates, `n_policy` policy updates.
+
+        Metrics are means over the cycle's updates (NaN if there were none) and sums over the
+        episodes that ended in it.
+        """
+        key, key_collect, key_model, key_policy = jax.random.split(state.key, 4)
+        collectors, collected = self.collect(state.learner, state.collectors, key_collect)
+        replay = self.store(state.replay, collected)
+        learner, model_metrics = repeat(
+            lambda learner, key: self.algorithm.update_model(learner, replay, key),
+            state.learner,
+            key_model,
+            n_model,
+        )
+        learner, policy_metrics = repeat(
+            lambda learner, key: self.algorithm.update_policy(learner, replay, key),
+            learner,
+            key_policy,
+            n_policy,
+        )
+        state = TrainState(
+            learner=learner,
+            replay=replay,
+            collectors=collectors,
+            key=key,
+            env_steps=state.env_steps + steps_in(collected),
+            cycles=state.cycles + 1,
+            model_updates=state.model_updates + n_model,
+            policy_updates=state.policy_updates + n_policy,
+        )
+        return state, model_metrics | policy_metrics | episode_sums(collected)
+
+    def collect(
+        self, learner: Learner, collectors: Collector, key: PRNGKey
+    ) -> tuple[Collector, Rollout]:
+        """Line 3: act in every environment, for one episode or a fixed number of rows."""
+        config = self.algorithm.config.training
+        executor = self.algorithm.executor(learner)
+        one_episode = config.collect_steps is None
+        n_rows = config.collect_steps or self.env.spec.episode_limit + 1
+        return jax.vmap(
+            lambda collector, key: rollout(
+                self.env, executor, collector, key, n_rows, one_episode
+            )
+        )(collectors, jax.random.split(key, config.num_envs))
+
+    def store(self, replay: Replay, collected: Rollout) -> Replay:
+        """Line 4: append the new rows, their rewards scaled."""
+        scale = self.algorithm.config.training.reward_scale
+        rows = collected.rows._replace(reward=collected.rows.reward * scale)
+        return jax.vmap(replays.add)(replay, rows, collected.count)
+
+
+def steps_in(collected: Rollout) -> Int[Array, ""]:
+    """Joint environment steps of a rollout: its valid rows less its resets."""
+    valid = jnp.arange(collected.rows.is_first.shape[-1]) < collected.count[..., None]
+    return (valid & ~collected.rows.is_first).sum(dtype=jnp.int32)
+
+
+def episode_sums(collected: Rollout) -> Metrics:
+    """Sums over the episodes that ended in a rollout."""
+    episodes = collected.episodes
+    return {
+        "episodes/count": episodes.ended.sum(),
+        "episodes/return": episodes.episode_return.sum(),
+        "episodes/length": episodes.length.sum(),
+        "episodes/score": episodes.score.sum(),
+    }
+
+
+def repeat(
+    update: Callable[[Any, PRNGKey], tuple[Any, Metrics]],
+    carry: Any,
+    key: PRNGKey,
+    n: Int[Array, ""],
+) -> tuple[Any, Metrics]:
+    """Apply `update` n times; n may be traced, so that prefill, pretraining and cycles share a program."""
+    shapes = jax.eval_shape(update, carry, key)[1]
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def body(i: Array, carry_sums: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
+        carry, sums = carry_sums
+        carry, metrics = update(carry, jax.random.fold_in(key, i))
+        return carry, jax.tree.map(jnp.add, sums, metrics)
+
+    carry, sums = jax.lax.fori_loop(0, n, body, (carry, zeros))
+    return carry, jax.tree.map(lambda x: x / n, sums)

@@ -1,0 +1,1 @@
+"""World models: one small file each, whose lines map onto the paper's equations."""

@@ -1,0 +1,183 @@
+"""What a world model is, its configuration, and the one loss that trains all of them."""
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from mabl.envs.base import ActionSpace, Discrete
+from mabl.losses.kl import balanced_kl, categorical_kl
+from mabl.types import Metrics, PRNGKey, TimeStep
+from mabl.world_models.heads import Predictions
+
+L = TypeVar("L")
+
+
+@dataclass(frozen=True)
+class WorldModelConfig:
+    """Sizes and losses of the world model. Defaults are the paper's for SMAC (Table 2)."""
+
+    hidden: int = 256
+    """Width of hidden layers and of the deterministic embeddings h."""
+    n_hidden: int = 2
+    """Hidden layers of each decoder and head."""
+    n_categoricals: int = 32
+    """Categorical variables of a latent state, at each level."""
+    n_classes: int = 32
+    """Classes of each categorical."""
+    agent_prior_input: Literal["prior", "posterior"] = "prior"
+    """Which global sample conditions the agent prior in training (sec. 3.2: prior; app. A: posterior)."""
+    reward_input: Literal["agent", "both"] = "agent"
+    """What the reward predictor sees: (z_agent, h_agent) as in the paper, or both levels."""
+    reward_loss: Literal["huber", "mse"] = "huber"
+    """Likelihood of the reward: smooth L1 with delta 1, or half the squared error."""
+    kl_reduction: Literal["mean", "sum"] = "mean"
+    """How the KL of a level is reduced over its categoricals."""
+    kl_weight: float = 1.0
+    """Weight of both KL terms in the loss."""
+    kl_prior_weight: float = 0.8
+    """KL balancing, cross-entropy weight: trains the prior towards the posterior."""
+    kl_posterior_weight: float = 0.2
+    """KL balancing, entropy weight: keeps the posterior near the prior."""
+    free_nats: float = 0.0
+    """Reduced KL of a level below which it is not trained."""
+    learning_rate: float = 3e-4
+    """Adam's learning rate (Table 4)."""
+    grad_clip: float = 100.0
+    """Largest global norm of the gradient."""
+    batch_size: int = 40
+    """Sequences in a model update."""
+    batch_length: int = 20
+    """Rows of a sequence."""
+
+
+class WorldModel(Protocol[L]):
+    """A latent-variable model of a team; one example, the caller vmaps over the batch.
+
+    `L` is the latent: a pytree whose leaves carry the agent axis.
+    """
+
+    filter: Any
+
+    def initial(self) -> L:
+        """Latent before an episode's first row."""
+        ...
+
+    def encode(self, row: TimeStep) -> Any:
+        """What of a row does not depend on the past."""
+        ...
+
+    def observe(self, latent: L, inputs: Any, key: PRNGKey) -> tuple[L, dict[str, Array]]:
+        """Posterior latent of the next row and its logits by level."""
+        ...
+
+    def prior(self, latent: L, key: PRNGKey) -> dict[str, Array]:
+        """Prior logits by level, from the deterministic part of a row's latent."""
+        ...
+
+    def imagine(self, latent: L, action: Float[Array, "N A"], key: PRNGKey) -> L:
+        """Prior latent of the next row after an encoded joint action."""
+        ...
+
+    def predict(self, latent: L) -> Predictions:
+        """What the model says of a row."""
+        ...
+
+    def actor_features(self, latent: L) -> Float[Array, "N F"]:
+        """What policies see."""
+        ...
+
+    def critic_features(self, latent: L) -> Float[Array, "N G"]:
+        """What critics see."""
+        ...
+
+
+def observe_sequence(
+    model: WorldModel[L], rows: TimeStep, key: PRNGKey
+) -> tuple[L, dict[str, Float[Array, "T N K C"]]]:
+    """Posterior latents `[T, N, ...]` and logits of one sequence, from a zero latent."""
+    inputs = jax.vmap(model.encode)(rows)
+    keys = jax.random.split(key, rows.is_first.shape[0])
+
+    def step(latent: L, at: tuple[Any, PRNGKey]) -> tuple[L, tuple[L, dict[str, Array]]]:
+        latent, logits = model.observe(latent, *at)
+        return latent, (latent, logits)
+
+    _, (latents, logits) = jax.lax.scan(step, model.initial(), (inputs, keys))
+    return latents, logits
+
+
+def model_loss(
+    model: WorldModel,
+    rows: TimeStep,
+    key: PRNGKey,
+    config: WorldModelConfig,
+    action_space: ActionSpace,
+) -> tuple[Float[Array, ""], Metrics]:
+    """L(psi) = L_ELBO + L_reward + L_termination + L_available + L_action (section 3.2).
+
+    `rows` are `[B, T, ...]`. Losses are sums over features and means over B, T and N; observations
+    and actions of dead agents do not count, nor does the action before a first row.
+    """
+    batch, length = rows.is_first.shape
+    key_observe, key_prior = jax.random.split(key)
+    latents, posterior = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
+        model, rows, jax.random.split(key_observe, batch)
+    )
+    keys_prior = jax.random.split(key_prior, (batch, length))
+    prior = jax.vmap(jax.vmap(model.prior))(latents, keys_prior)
+    predicted = jax.vmap(jax.vmap(model.predict))(latents)
+
+    alive = rows.alive.astype(jnp.float32)
+    acted = alive * ~rows.is_first[..., None]
+    losses = {
+        "obs": (alive * optax.huber_loss(predicted.obs, rows.obs).sum(-1)).mean(),
+        "reward": reward_loss(predicted.reward, rows.reward, config.reward_loss).mean(),
+        "terminated": optax.sigmoid_binary_cross_entropy(
+            predicted.terminated, rows.terminated.astype(jnp.float32)
+        ).mean(),
+        "available": optax.sigmoid_binary_cross_entropy(
+            predicted.available, rows.available.astype(jnp.float32)
+        )
+        .sum(-1)
+        .mean(),
+        "action": (acted * action_loss(predicted.action, rows.prev_action, action_space)).mean(),
+    }
+    for level in posterior:
+        losses[f"kl_{level}"] = (
+            config.kl_weight
+            * balanced_kl(
+                posterior[level],
+                prior[level],
+                config.kl_prior_weight,
+                config.kl_posterior_weight,
+                config.kl_reduction,
+                config.free_nats,
+            ).mean()
+        )
+    total = jnp.stack(list(losses.values())).sum()
+    metrics = {f"world_model/loss_{name}": value for name, value in losses.items()}
+    metrics["world_model/loss"] = total
+    for level in posterior:
+        nats = categorical_kl(posterior[level], prior[level]).sum(-1).mean()
+        metrics[f"world_model/kl_{level}"] = nats
+    return total, metrics
+
+
+def reward_loss(
+    predicted: Float[Array, "*b"], reward: Float[Array, "*b"], kind: str
+) -> Float[Array, "*b"]:
+    """-log p(r | ...) up to a constant: Huber (smooth L1) or Gaussian with unit variance."""
+    return {"huber": optax.huber_loss, "mse": optax.l2_loss}[kind](predicted, reward)
+
+
+def action_loss(
+    predicted: Float[Array, "*b A"], action: Array, space: ActionSpace
+) -> Float[Array, "*b"]:
+    """-log p(a_{t-1} | ...): cross-entropy, or Gaussian with unit variance up to a constant."""
+    if isinstance(space, Discrete):
+        return optax.softmax_cross_entropy_with_integer_labels(predicted, action)
+    return optax.l2_loss(predicted, action).sum(-1)

@@ -1,0 +1,172 @@
+"""MABL's bi-level world model (section 3.1): written for agent i, then vmapped over agents."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mabl.envs.base import EnvSpec
+from mabl.nets.mlp import MLP
+from mabl.types import PRNGKey, TimeStep
+from mabl.world_models.base import WorldModelConfig
+from mabl.world_models.heads import Heads, Predictions
+from mabl.world_models.levels import AgentFilter, Categoricals, Level, Recurrent, draw
+
+
+class Latent(NamedTuple):
+    """Both levels of every agent; fields `[N, ...]`, or without N inside the per-agent functions."""
+
+    agent: Level
+    global_: Level
+
+
+class Inputs(NamedTuple):
+    """A row as the scan over time needs it: all that does not recur is computed beforehand."""
+
+    prev_action: Float[Array, "N A"]
+    obs: Float[Array, "N D"]
+    state: Float[Array, " D"]
+    is_first: Array
+
+
+class MABL(eqx.Module):
+    """Bi-level latent-variable world model; parameters shared by all agents."""
+
+    filter: AgentFilter
+    state_encoder: MLP
+    global_recurrent: Recurrent
+    global_posterior: Categoricals
+    global_prior: Categoricals
+    agent_prior: Categoricals
+    heads: Heads
+    spec: EnvSpec = eqx.field(static=True)
+    config: WorldModelConfig = eqx.field(static=True)
+
+    def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
+        keys = jax.random.split(key, 7)
+        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
+        latent_dim, action_dim = k * c, spec.action_space.size
+        level_dim = hidden + latent_dim
+        self.spec, self.config = spec, config
+        self.filter = AgentFilter(spec.obs_dim, action_dim, hidden, k, c, keys[0])
+        self.state_encoder = MLP(spec.state_dim, hidden, hidden, 2, keys[1])
+        self.global_recurrent = Recurrent(latent_dim, spec.n_agents * action_dim, hidden, keys[2])
+        self.global_posterior = Categoricals(2 * hidden + latent_dim, hidden, k, c, keys[3])
+        self.global_prior = Categoricals(hidden, hidden, k, c, keys[4])
+        self.agent_prior = Categoricals(hidden + latent_dim, hidden, k, c, keys[5])
+        self.heads = Heads(
+            agent_dim=level_dim,
+            reward_dim={"agent": level_dim, "both": 2 * level_dim}[config.reward_input],
+            full_dim=2 * level_dim,
+            obs_dim=spec.obs_dim,
+            action_dim=action_dim,
+            hidden=hidden,
+            n_hidden=config.n_hidden,
+            key=keys[6],
+        )
+
+    def initial(self) -> Latent:
+        """The team's latent before an episode's first row: zeros."""
+        level = jax.tree.map(
+            lambda x: jnp.zeros((self.spec.n_agents, *x.shape)), self.filter.initial()
+        )
+        return Latent(agent=level, global_=level)
+
+    def encode(self, row: TimeStep) -> Inputs:
+        """Encode actions, observations and the state of one row."""
+        return Inputs(
+            prev_action=self.spec.action_space.encode(row.prev_action),
+            obs=jax.vmap(self.filter.embed)(row.obs),
+            state=jax.nn.relu(self.state_encoder(row.state)),
+            is_first=row.is_first,
+        )
+
+    def observe(
+        self, latent: Latent, inputs: Inputs, key: PRNGKey
+    ) -> tuple[Latent, dict[str, Float[Array, "N K C"]]]:
+        """Posterior latents of the next row, and their logits by level (representation model).
+
+        h^a_t = f(h^a_{t-1}, z^a_{t-1}, a^i_{t-1}),   z^a_t ~ q(z^a_t | o^i_t, h^a_t)
+        h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^a_t, h^g_t)
+        """
+        latent, prev_action = jax.tree.map(
+            lambda x: jnp.where(inputs.is_first, jnp.zeros_like(x), x),
+            (latent, inputs.prev_action),
+        )
+        joint_action = prev_action.ravel()
+
+        def observe_agent(
+            latent: Latent, prev_action: Array, obs: Array, key: PRNGKey
+        ) -> tuple[Latent, dict[str, Array]]:
+            key_agent, key_global = jax.random.split(key)
+            agent, agent_logits = self.filter.infer(latent.agent, prev_action, obs, key_agent)
+            h = self.global_recurrent(latent.global_, joint_action)
+            global_logits = self.global_posterior(inputs.state, agent.z, h)
+            global_ = Level(h, draw(global_logits, key_global))
+            return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
+
+        keys = jax.random.split(key, self.spec.n_agents)
+        return jax.vmap(observe_agent)(latent, prev_action, inputs.obs, keys)
+
+    def prior(self, latent: Latent, key: PRNGKey) -> dict[str, Float[Array, "N K C"]]:
+        """Prior logits by level for the row whose embeddings `latent` holds (transition model).
+
+        p(z^g_t | h^g_t) and p(z^a_t | h^a_t, z^g_t) with z^g_t a sample of the global prior
+        (section 3.2; `config.agent_prior_input` can make it the posterior sample of appendix A).
+        """
+
+        def prior_agent(latent: Latent, key: PRNGKey) -> dict[str, Array]:
+            global_logits = self.global_prior(latent.global_.h)
+            z_global = {
+                "prior": draw(global_logits, key),
+                "posterior": latent.global_.z,
+            }[self.config.agent_prior_input]
+            return {
+                "agent": self.agent_prior(latent.agent.h, z_global),
+                "global": global_logits,
+            }
+
+        return jax.vmap(prior_agent)(latent, jax.random.split(key, self.spec.n_agents))
+
+    def imagine(
+        self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey
+    ) -> Latent:
+        """Prior latents of the next row after the joint (encoded) action: no observation, no state.
+
+        h_{t+1} as in `observe`, then z^g ~ p(z^g | h^g) and z^a ~ p(z^a | h^a, z^g).
+        """
+        joint_action = action.ravel()
+
+        def imagine_agent(latent: Latent, action: Array, key: PRNGKey) -> Latent:
+            key_agent, key_global = jax.random.split(key)
+            h_global = self.global_recurrent(latent.global_, joint_action)
+            z_global = draw(self.global_prior(h_global), key_global)
+            h_agent = self.filter.recurrent(latent.agent, action)
+            z_agent = draw(self.agent_prior(h_agent, z_global), key_agent)
+            return Latent(Level(h_agent, z_agent), Level(h_global, z_global))
+
+        keys = jax.random.split(key, self.spec.n_agents)
+        return jax.vmap(imagine_agent)(latent, action, keys)
+
+    def predict(self, latent: Latent) -> Predictions:
+        """Decode a row for every agent: fields `[N, ...]`.
+
+        o^i_t from (z^a, h^a); r^i_t likewise (`config.reward_input`); termination, availability and
+        a^i_{t-1} from both levels.
+        """
+        agent = self.actor_features(latent)
+        full = self.critic_features(latent)
+        reward_input = {"agent": agent, "both": full}[self.config.reward_input]
+        return jax.vmap(self.heads)(agent, reward_input, full)
+
+    def actor_features(self, latent: Latent) -> Float[Array, "N F"]:
+        """(z^a, h^a): all that a policy may see (section 3.3)."""
+        return jnp.concatenate([latent.agent.z, latent.agent.h], axis=-1)
+
+    def critic_features(self, latent: Latent) -> Float[Array, "N G"]:
+        """(z^a, z^g, h^a, h^g): the centralised critic's input."""
+        return jnp.concatenate(
+            [latent.agent.z, latent.global_.z, latent.agent.h, latent.global_.h], axis=-1
+        )
