@@ -1,1 +1,14 @@
-"""MABL: sample-efficient multi-agent reinforcement learning with bi-level world models."""
+"""MABL: sample-efficient multi-agent reinforcement learning with bi-level world models.
+
+    import mabl
+    outcome = mabl.train(mabl.preset("quick", "smax/3m", "mabl"))
+    policy = mabl.Policy.load(outcome.folders[0])
+"""
+
+from mabl.algorithms.config import Config
+from mabl.algorithms.presets import preset
+from mabl.errors import UserError
+from mabl.policy import Policy
+from mabl.training.run import resume, train
+
+__all__ = ["Config", "Policy", "UserError", "preset", "resume", "train"]

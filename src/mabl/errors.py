@@ -14,3 +14,23 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     near = get_close_matches(name, names, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     return UserError(f"unknown {kind} {name!r}: {hint}choose from {', '.join(names)}")
+
+
+def require_positive(config: object, *names: str) -> None:
+    """Raise UserError unless each named field of a config is None or above 0."""
+    for name in names:
+        value = getattr(config, name)
+        if value is not None and not value > 0:
+            raise _out_of_range(name, value, "a number above 0")
+
+
+def require_between(config: object, low: float, high: float, *names: str) -> None:
+    """Raise UserError unless each named field of a config lies in [low, high]."""
+    for name in names:
+        value = getattr(config, name)
+        if not low <= value <= high:
+            raise _out_of_range(name, value, f"a number from {low:g} to {high:g}")
+
+
+def _out_of_range(name: str, value: object, expected: str) -> UserError:
+    return UserError(f"--{name.replace('_', '-')} is {value!r}: give {expected}")

@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple, Protocol
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -27,9 +26,15 @@ class Executor(Protocol):
         ...
 
 
+class LocalPolicy(NamedTuple):
+    """All that an agent needs to act: shared parameters of its filter and its actor."""
+
+    filter: AgentFilter
+    actor: Actor
+
+
 def act_alone(
-    agent_filter: AgentFilter,
-    actor: Actor,
+    policy: LocalPolicy,
     action_space: ActionSpace,
     level: Level,
     prev_action: Array,
@@ -48,17 +53,16 @@ def act_alone(
     level, encoded = jax.tree.map(
         lambda x: jnp.where(is_first, jnp.zeros_like(x), x), (level, encoded)
     )
-    level = agent_filter(level, encoded, obs, key_latent)
-    policy = actor(jnp.concatenate([level.z, level.h]), available)
-    action = policy.mode() if greedy else policy.sample(key_action)
+    level = policy.filter(level, encoded, obs, key_latent)
+    choice = policy.actor(jnp.concatenate([level.z, level.h]), available)
+    action = choice.mode() if greedy else choice.sample(key_action)
     return level, action.astype(jnp.int32)
 
 
 class LocalExecutor(NamedTuple):
     """Decentralised execution: the same filter and actor for every agent, each on its own row."""
 
-    filter: AgentFilter
-    actor: Actor
+    policy: LocalPolicy
     action_space: ActionSpace
     greedy: bool = False
 
@@ -66,7 +70,7 @@ class LocalExecutor(NamedTuple):
         """Zero latents `[N, ...]`."""
         n_agents = row.obs.shape[0]
         return jax.tree.map(
-            lambda x: jnp.zeros((n_agents, *x.shape), x.dtype), self.filter.initial()
+            lambda x: jnp.zeros((n_agents, *x.shape), x.dtype), self.policy.filter.initial()
         )
 
     def act(self, memory: Level, row: TimeStep, key: PRNGKey) -> tuple[Level, Array]:
@@ -75,8 +79,7 @@ class LocalExecutor(NamedTuple):
 
         def one(level, prev_action, obs, available, key):
             return act_alone(
-                self.filter,
-                self.actor,
+                self.policy,
                 self.action_space,
                 level,
                 prev_action,
@@ -87,7 +90,7 @@ class LocalExecutor(NamedTuple):
                 self.greedy,
             )
 
-        return eqx.filter_vmap(one)(memory, row.prev_action, row.obs, row.available, keys)
+        return jax.vmap(one)(memory, row.prev_action, row.obs, row.available, keys)
 
 
 class RandomExecutor(NamedTuple):

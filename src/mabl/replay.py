@@ -4,7 +4,6 @@ Functions are written for one lane (one environment's rows, contiguous in time) 
 caller vmaps over lanes. All of it lives on the device and inside the compiled training cycle.
 """
 
-import math
 from typing import NamedTuple
 
 import jax
@@ -59,11 +58,6 @@ def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int)
     oldest = (replay.cursor - replay.size)[lane]
     index = (oldest[:, None] + age[:, None] + jnp.arange(length)) % capacity
     return jax.tree.map(lambda x: x[lane[:, None], index], replay.rows)
-
-
-def nbytes(row: TimeStep, capacity: int) -> int:
-    """Memory in bytes that `capacity` rows shaped like `row` take."""
-    return capacity * sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(row))
 
 
 def check_memory(needed: int, free: int | None) -> None:

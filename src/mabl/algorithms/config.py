@@ -1,9 +1,17 @@
 """The configuration of a run, composed of what each package owns. Units: joint environment steps."""
 
-from dataclasses import dataclass, field
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from math import inf
+from typing import Any, Literal, TypeVar
 
 from mabl.behaviour.mappo import MAPPOConfig
+from mabl.errors import UserError, require_between, require_positive, unknown_name
 from mabl.world_models.base import WorldModelConfig
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -26,6 +34,18 @@ class TrainingConfig:
     """Environment steps that the replay holds."""
     reward_scale: float = 1.0
     """Factor on the environment's rewards for learning; logged returns are unscaled."""
+    diagnose_every: int = 10_000
+    """Environment steps between diagnostics of the world model."""
+    checkpoint_every: int = 20_000
+    """Environment steps between checkpoints."""
+    keep_checkpoints: int = 2
+    """Checkpoints kept, newest first."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "num_envs", "collect_steps", "replay_capacity", "reward_scale")
+        require_positive(self, "diagnose_every", "checkpoint_every", "keep_checkpoints")
+        require_between(self, 0, inf, "model_updates", "policy_updates", "prefill_steps")
+        require_between(self, 0, inf, "pretrain_updates")
 
 
 @dataclass(frozen=True)
@@ -36,7 +56,7 @@ class Config:
     """Environment: `mabl envs` lists them."""
     algo: str = "mabl"
     """Algorithm: `mabl algos` lists them."""
-    preset: str = "quick"
+    preset: Literal["quick", "paper"] = "quick"
     """Hyperparameters to start from: `quick` (a 2-core CPU) or `paper` (Tables 2 to 4)."""
     total_steps: int = 100_000
     """Environment steps of the run; one step is one joint step of the team."""
@@ -49,3 +69,45 @@ class Config:
     training: TrainingConfig = field(default_factory=TrainingConfig)
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
     mappo: MAPPOConfig = field(default_factory=MAPPOConfig)
+
+    def __post_init__(self) -> None:
+        require_positive(self, "total_steps", "num_seeds")
+        require_between(self, 0, 2**32 - 1, "seed")
+        shortest = self.training.replay_capacity // self.training.num_envs
+        if shortest < self.world_model.batch_length:
+            raise UserError(
+                f"--training.replay-capacity {self.training.replay_capacity} leaves {shortest} rows "
+                f"for each of {self.training.num_envs} environments: give at least "
+                f"{self.world_model.batch_length * self.training.num_envs}"
+            )
+
+
+def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
+    """A frozen config dataclass from nested plain data, as `dataclasses.asdict` makes it.
+
+    Raises UserError for unknown fields and for values of another type than the field's.
+    """
+    if not isinstance(data, Mapping):
+        raise UserError(f"config {path or 'file'} is {data!r}: give a mapping of fields")
+    hints = typing.get_type_hints(cls)
+    names = [f.name for f in fields(cls)]  # pyright: ignore[reportArgumentType]
+    for name in data:
+        if name not in names:
+            raise unknown_name("config field", f"{path}{name}", (f"{path}{n}" for n in names))
+    return cls(**{name: _value(hints[name], value, f"{path}{name}") for name, value in data.items()})
+
+
+def _value(hint: Any, value: Any, path: str) -> Any:
+    if is_dataclass(hint):
+        return from_dict(typing.cast(type, hint), value, f"{path}.")
+    options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    if typing.get_origin(hint) is Literal:
+        if value in typing.get_args(hint):
+            return value
+        raise unknown_name(path, str(value), typing.get_args(hint))
+    if float in options and type(value) is int:
+        return float(value)
+    if type(value) in options:
+        return value
+    expected = " or ".join(getattr(option, "__name__", str(option)) for option in options)
+    raise UserError(f"config field {path} is {value!r}: give {expected}")

@@ -10,10 +10,11 @@ from einops import rearrange
 from jaxtyping import Array, Float
 
 from mabl.algorithms.config import Config
+from mabl.algorithms.diagnostics import OPEN_LOOP_STEPS, diagnose
 from mabl.behaviour import mappo
 from mabl.behaviour.mappo import MAPPO
 from mabl.envs.base import EnvSpec
-from mabl.execution import LocalExecutor
+from mabl.execution import LocalExecutor, LocalPolicy
 from mabl.imagination import imagine_trajectory
 from mabl.replay import Replay, sample_sequences
 from mabl.types import Metrics, PRNGKey, TimeStep, is_last
@@ -49,11 +50,13 @@ class ModelBased(NamedTuple):
         )
         return Learner(model, self._optimiser().init(eqx.filter(model, eqx.is_array)), behaviour)
 
-    def executor(self, learner: Learner, greedy: bool = False) -> LocalExecutor:
-        """How the learned policy acts in the environment."""
-        return LocalExecutor(
-            learner.model.filter, learner.behaviour.actor, self.spec.action_space, greedy
-        )
+    def policy(self, learner: Learner) -> LocalPolicy:
+        """What of the learner is needed to act: all that is exported or deployed."""
+        return LocalPolicy(learner.model.filter, learner.behaviour.actor)
+
+    def executor(self, policy: LocalPolicy, greedy: bool = False) -> LocalExecutor:
+        """How a policy acts in the environment."""
+        return LocalExecutor(policy, self.spec.action_space, greedy)
 
     def update_model(
         self, learner: Learner, replay: Replay, key: PRNGKey
@@ -95,6 +98,13 @@ class ModelBased(NamedTuple):
         )(start, available, jax.random.split(key_imagine, weight.shape[0]))
         behaviour, metrics = mappo.update(learner.behaviour, trajectory, weight, key_ppo, config)
         return learner._replace(behaviour=behaviour), metrics
+
+    def diagnose(self, learner: Learner, replay: Replay, key: PRNGKey) -> Metrics:
+        """How well the world model predicts sequences of the replay."""
+        key_sample, key_diagnose = jax.random.split(key)
+        length = max(OPEN_LOOP_STEPS) + 5
+        rows = sample_sequences(replay, key_sample, 64, length)
+        return diagnose(learner.model, rows, key_diagnose, self.spec.action_space)
 
     def _optimiser(self) -> optax.GradientTransformation:
         config = self.config.world_model

@@ -1,6 +1,7 @@
 """Multi-agent PPO on latent trajectories (section 3.3, Table 3, [46])."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 
 from mabl.behaviour.actor import Actor
 from mabl.behaviour.critic import Critic
+from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.ppo import clipped_surrogate
 from mabl.losses.returns import lambda_returns
 from mabl.types import Metrics, PRNGKey, Trajectory
@@ -61,6 +63,17 @@ class MAPPOConfig:
     """Rows of an imagined trajectory, the start included."""
     n_starts: int | None = None
     """Start states drawn from the posterior states of a batch; None: all, as in the paper."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "hidden", "n_hidden", "n_heads", "n_epochs", "batch_size", "n_starts")
+        require_positive(self, "actor_learning_rate", "critic_learning_rate", "grad_clip", "clip")
+        require_between(self, 0, 1, "gamma", "gae_lambda", "ent_decay")
+        require_between(self, 0, inf, "actor_weight_decay", "ent_coef", "value_coef")
+        require_between(self, 2, inf, "horizon")
+        if self.hidden % self.n_heads:
+            raise UserError(
+                f"--mappo.hidden is {self.hidden}: give a multiple of --mappo.n-heads {self.n_heads}"
+            )
 
 
 class MAPPO(NamedTuple):

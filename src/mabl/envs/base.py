@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Shaped
 
 from mabl.types import PRNGKey, TimeStep
@@ -21,6 +23,11 @@ class Discrete:
     def shape(self) -> tuple[int, ...]:
         """Shape of one agent's action."""
         return ()
+
+    @property
+    def dtype(self) -> DTypeLike:
+        """Of an action."""
+        return jnp.int32
 
     @property
     def size(self) -> int:
@@ -42,6 +49,11 @@ class Continuous:
     def shape(self) -> tuple[int, ...]:
         """Shape of one agent's action."""
         return (self.size,)
+
+    @property
+    def dtype(self) -> DTypeLike:
+        """Of an action."""
+        return jnp.float32
 
     def encode(self, action: Float[Array, "*b A"]) -> Float[Array, "*b A"]:
         """The action itself."""

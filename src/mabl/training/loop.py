@@ -39,7 +39,7 @@ class Training(NamedTuple):
         config = self.algorithm.config.training
         key, key_learner, key_envs = jax.random.split(key, 3)
         learner = self.algorithm.init(key_learner)
-        executor = self.algorithm.executor(learner)
+        executor = self.algorithm.executor(self.algorithm.policy(learner))
         collectors = jax.vmap(lambda key: start(self.env, executor, key))(
             jax.random.split(key_envs, config.num_envs)
         )
@@ -87,7 +87,7 @@ class Training(NamedTuple):
     ) -> tuple[Collector, Rollout]:
         """Line 3: act in every environment, for one episode or a fixed number of rows."""
         config = self.algorithm.config.training
-        executor = self.algorithm.executor(learner)
+        executor = self.algorithm.executor(self.algorithm.policy(learner))
         one_episode = config.collect_steps is None
         n_rows = config.collect_steps or self.env.spec.episode_limit + 1
         return jax.vmap(

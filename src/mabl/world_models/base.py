@@ -1,6 +1,7 @@
 """What a world model is, its configuration, and the one loss that trains all of them."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Literal, Protocol, TypeVar
 
 import jax
@@ -9,6 +10,7 @@ import optax
 from jaxtyping import Array, Float
 
 from mabl.envs.base import ActionSpace, Discrete
+from mabl.errors import require_between, require_positive
 from mabl.losses.kl import balanced_kl, categorical_kl
 from mabl.types import Metrics, PRNGKey, TimeStep
 from mabl.world_models.heads import Predictions
@@ -52,6 +54,12 @@ class WorldModelConfig:
     """Sequences in a model update."""
     batch_length: int = 20
     """Rows of a sequence."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "hidden", "n_hidden", "n_categoricals", "n_classes", "batch_size")
+        require_positive(self, "batch_length", "learning_rate", "grad_clip")
+        require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
+        require_between(self, 0, inf, "free_nats")
 
 
 class WorldModel(Protocol[L]):

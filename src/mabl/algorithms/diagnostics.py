@@ -1,0 +1,109 @@
+"""How good the world model is, in numbers a user can act on (logged as `world_model/...`)."""
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float
+
+from mabl.envs.base import ActionSpace
+from mabl.types import Metrics, PRNGKey, TimeStep
+from mabl.world_models.base import WorldModel, observe_sequence
+from mabl.world_models.heads import Predictions
+
+OPEN_LOOP_STEPS = (1, 5, 15)
+
+
+def diagnose(
+    model: WorldModel, rows: TimeStep, key: PRNGKey, action_space: ActionSpace
+) -> Metrics:
+    """Diagnostics on real sequences `[B, T]`, T > 15.
+
+    `posterior` metrics decode the latent that has seen the row; `prior` ones the latent predicted
+    for it one step before. Open-loop errors predict k steps ahead from real actions alone, and are
+    relative: 1 is as bad as always predicting the mean, 0 is perfect. Everything stays within
+    episodes.
+    """
+    batch, length = rows.is_first.shape
+    key_observe, key_imagine = jax.random.split(key)
+    latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
+        model, rows, jax.random.split(key_observe, batch)
+    )
+    posterior = jax.vmap(jax.vmap(model.predict))(latents)
+    wins = jnp.nan_to_num(rows.score) > 0
+    metrics = {
+        "world_model/reconstruction": optax.squared_error(posterior.obs, rows.obs).mean(),
+        "world_model/reward_unexplained_posterior": unexplained(
+            posterior.reward, rows.reward, jnp.ones_like(rows.is_first)
+        ),
+        "world_model/reward_on_wins": masked_mean(posterior.reward.mean(-1), wins),
+        "world_model/reward_on_wins_real": masked_mean(rows.reward.mean(-1), wins),
+        "world_model/terminated_accuracy": (
+            (posterior.terminated > 0) == rows.terminated
+        ).mean(),
+        "world_model/available_accuracy": ((posterior.available > 0) == rows.available).mean(),
+    }
+    ahead = open_loop(model, latents, rows, key_imagine, action_space, max(OPEN_LOOP_STEPS))
+    metrics["world_model/reward_unexplained_prior"] = open_loop_error(
+        ahead.reward[..., None], rows.reward[..., None], rows, 1
+    )
+    for k in OPEN_LOOP_STEPS:
+        metrics[f"world_model/open_loop_obs_{k}"] = open_loop_error(ahead.obs, rows.obs, rows, k)
+        metrics[f"world_model/open_loop_reward_{k}"] = open_loop_error(
+            ahead.reward[..., None], rows.reward[..., None], rows, k
+        )
+    return metrics
+
+
+def open_loop(
+    model: WorldModel,
+    latents: object,
+    rows: TimeStep,
+    key: PRNGKey,
+    action_space: ActionSpace,
+    steps: int,
+) -> Predictions:
+    """Predictions `[K, B, T - K, N, ...]`: entry (k, b, t) is for row t + k + 1, from row t."""
+    batch, length = rows.is_first.shape
+    n_starts = length - steps
+    actions = action_space.encode(rows.prev_action)
+
+    def one(latent: object, actions: Array, key: PRNGKey) -> Predictions:
+        def step(latent: object, at: tuple[Array, PRNGKey]) -> tuple[object, Predictions]:
+            latent = model.imagine(latent, *at)
+            return latent, model.predict(latent)
+
+        return jax.lax.scan(step, latent, (actions, jax.random.split(key, steps)))[1]
+
+    windows = jnp.arange(n_starts)[:, None] + jnp.arange(1, steps + 1)
+    return jax.vmap(jax.vmap(one, out_axes=1), out_axes=1)(
+        jax.tree.map(lambda x: x[:, :n_starts], latents),
+        actions[:, windows],
+        jax.random.split(key, (batch, n_starts)),
+    )
+
+
+def open_loop_error(
+    predicted: Float[Array, "K B W N F"], real: Float[Array, "B T N F"], rows: TimeStep, k: int
+) -> Float[Array, ""]:
+    """Squared error k steps ahead over the variance of the target, within episodes."""
+    n_starts = predicted.shape[2]
+    target = real[:, k : k + n_starts]
+    resets = jnp.cumsum(rows.is_first, axis=1)
+    same_episode = resets[:, k : k + n_starts] == resets[:, :n_starts]
+    return unexplained(predicted[k - 1], target, same_episode)
+
+
+def unexplained(
+    predicted: Float[Array, "B T ..."], real: Float[Array, "B T ..."], mask: Bool[Array, "B T"]
+) -> Float[Array, ""]:
+    """Share of the target's variance that the prediction leaves: 1 - R^2."""
+    weight = mask.reshape(*mask.shape, *[1] * (real.ndim - 2)).astype(jnp.float32)
+    weight = jnp.broadcast_to(weight, real.shape)
+    total = weight.sum((0, 1)) + 1e-8
+    mean = (weight * real).sum((0, 1)) / total
+    return (weight * (predicted - real) ** 2).sum() / ((weight * (real - mean) ** 2).sum() + 1e-8)
+
+
+def masked_mean(values: Float[Array, "..."], mask: Bool[Array, "..."]) -> Float[Array, ""]:
+    """Mean where the mask holds; NaN where it never does."""
+    return (values * mask).sum() / mask.sum()

@@ -1,0 +1,112 @@
+"""Presets as data: the paper's tables, and settings sized for a 2-core CPU."""
+
+from dataclasses import replace
+
+from mabl.algorithms.config import Config, TrainingConfig
+from mabl.behaviour.mappo import MAPPOConfig
+from mabl.errors import unknown_name
+from mabl.world_models.base import WorldModelConfig
+
+SMAX_REWARD_SCALE = 10.0
+"""SMAX pays at most 2 in an episode, SMAC about 20, for which the paper's losses are sized."""
+
+PAPER = {
+    # Tables 2 and 3, column SMAC; Table 4's rows below override the learning rate of the model.
+    "smax": Config(
+        preset="paper",
+        total_steps=100_000,
+        training=TrainingConfig(reward_scale=SMAX_REWARD_SCALE),
+    ),
+    "test": Config(preset="paper", total_steps=10_000),
+}
+
+PAPER_MODEL_LEARNING_RATE = {"smax/3s_vs_5z": 5e-4}
+"""Table 4; every other SMAC map has the default 3e-4."""
+
+QUICK = {
+    "smax": Config(
+        preset="quick",
+        total_steps=100_000,
+        training=TrainingConfig(
+            num_envs=16,
+            collect_steps=16,
+            model_updates=6,
+            policy_updates=1,
+            prefill_steps=5_000,
+            pretrain_updates=150,
+            replay_capacity=100_000,
+            reward_scale=SMAX_REWARD_SCALE,
+        ),
+        world_model=WorldModelConfig(
+            hidden=128,
+            n_categoricals=8,
+            n_classes=8,
+            reward_input="both",
+            reward_loss="mse",
+            kl_reduction="sum",
+            learning_rate=1e-3,
+            batch_size=16,
+        ),
+        mappo=MAPPOConfig(
+            hidden=128,
+            actor_out_scale=0.01,
+            actor_learning_rate=1e-3,
+            critic_learning_rate=1e-3,
+            ent_coef=0.02,
+            n_starts=128,
+        ),
+    ),
+    "test": Config(
+        preset="quick",
+        total_steps=10_000,
+        training=TrainingConfig(
+            num_envs=8,
+            collect_steps=16,
+            model_updates=10,
+            policy_updates=2,
+            prefill_steps=500,
+            pretrain_updates=50,
+            replay_capacity=20_000,
+            diagnose_every=2_000,
+        ),
+        world_model=WorldModelConfig(
+            hidden=64,
+            n_categoricals=4,
+            n_classes=8,
+            reward_input="both",
+            reward_loss="mse",
+            kl_reduction="sum",
+            learning_rate=1e-3,
+            batch_size=16,
+            batch_length=10,
+        ),
+        mappo=MAPPOConfig(
+            hidden=64,
+            actor_out_scale=0.01,
+            actor_learning_rate=1e-3,
+            ent_coef=0.02,
+            horizon=6,
+            n_starts=128,
+        ),
+    ),
+}
+
+PRESETS = {"quick": QUICK, "paper": PAPER}
+
+
+def preset(name: str, env: str, algo: str) -> Config:
+    """The configuration that a preset gives for an environment and an algorithm.
+
+    Raises UserError for an unknown preset or family of environments.
+    """
+    if name not in PRESETS:
+        raise unknown_name("preset", name, PRESETS)
+    families = PRESETS[name]
+    family = env.split("/")[0]
+    if family not in families:
+        raise unknown_name("environment", env, (f"{family}/..." for family in families))
+    config = replace(families[family], env=env, algo=algo)
+    if name == "paper" and env in PAPER_MODEL_LEARNING_RATE:
+        rate = PAPER_MODEL_LEARNING_RATE[env]
+        config = replace(config, world_model=replace(config.world_model, learning_rate=rate))
+    return config

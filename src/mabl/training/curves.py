@@ -1,0 +1,46 @@
+"""`curves.png`: the run at a glance."""
+
+from pathlib import Path
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from mabl.runs.metrics import Row, column
+
+matplotlib.use("agg")
+
+PANELS = {
+    "score of training episodes": ("train/win_rate", "train/score"),
+    "return: real and imagined": ("train/episode_return", "behaviour/imagined_return"),
+    "entropy of the policy (nats)": ("behaviour/entropy",),
+    "KL (nats)": ("world_model/kl_agent", "world_model/kl_global"),
+    "reward variance unexplained": (
+        "world_model/reward_unexplained_posterior",
+        "world_model/reward_unexplained_prior",
+    ),
+    "open-loop observation error (1 = mean)": (
+        "world_model/open_loop_obs_1",
+        "world_model/open_loop_obs_5",
+        "world_model/open_loop_obs_15",
+    ),
+}
+
+
+def draw(rows: list[Row], title: str, path: Path) -> None:
+    """Plot a run's metrics; the file is replaced whole, so that a viewer never sees half of it."""
+    figure = Figure(figsize=(12, 6.5), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(2, 3).ravel()
+    for axis, (panel, names) in zip(axes, PANELS.items(), strict=True):
+        for name in names:
+            steps, values = column(rows, name)
+            if steps:
+                axis.plot(steps, values, label=name.split("/")[1], linewidth=1.5)
+        axis.set_title(panel, fontsize=10)
+        axis.set_xlabel("environment steps", fontsize=9)
+        axis.grid(alpha=0.3)
+        if axis.lines:
+            axis.legend(fontsize=8, frameon=False)
+    temporary = path.with_name(f".{path.name}")
+    figure.savefig(temporary, dpi=100, format="png")
+    temporary.replace(path)

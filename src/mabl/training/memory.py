@@ -1,0 +1,24 @@
+"""How much memory there is, and how much a run takes."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+
+
+def tree_bytes(tree: Any) -> int:
+    """Bytes of all arrays of a pytree (or of their shapes)."""
+    return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
+
+def free_memory() -> int | None:
+    """Free bytes on the default device; None where the system does not say."""
+    stats = jax.devices()[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return stats["bytes_limit"] - stats["bytes_in_use"]
+    meminfo = Path("/proc/meminfo")
+    if not meminfo.exists():
+        return None
+    lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
+    return int(lines["MemAvailable"].split()[0]) * 1024

@@ -1,0 +1,237 @@
+"""A training run from start to finish: folders, progress, metrics, checkpoints, interruption."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from mabl.algorithms import registry as algorithms
+from mabl.algorithms.config import Config
+from mabl.envs import registry as envs
+from mabl.envs.base import EnvSpec
+from mabl.errors import UserError
+from mabl.replay import check_memory
+from mabl.runs import folder
+from mabl.training import curves
+from mabl.runs.checkpoint import Checkpoints
+from mabl.training.loop import Training, TrainState
+from mabl.training.memory import free_memory, tree_bytes
+from mabl.runs.metrics import MetricsLog, Row, read
+from mabl.training.progress import Progress, duration
+
+CURVES_EVERY = 30.0
+"""Seconds between refreshes of curves.png."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    folders: list[Path]
+    interrupted: bool
+
+
+def train(config: Config, console: Console | None = None) -> Outcome:
+    """Train from scratch, one run folder for each seed. Raises UserError for a user's mistake."""
+    console = console or Console(stderr=True)
+    training = build(config)
+    seeds = range(config.seed, config.seed + config.num_seeds)
+    shape = jax.eval_shape(training.init, jax.random.key(0))
+    needed = config.num_seeds * tree_bytes(shape.replay)
+    console.print(
+        f"{config.algo} on {config.env}: replay {needed / 2**20:,.0f} MiB, parameters and "
+        f"optimisers {config.num_seeds * tree_bytes(shape.learner) / 2**20:,.0f} MiB",
+        highlight=False,
+    )
+    check_memory(needed, free_memory())
+    folders = [folder.create(config, seed) for seed in seeds]
+    for path in folders:
+        console.print(f"run folder {path}", highlight=False, soft_wrap=True)
+    keys = jnp.stack([jax.random.key(seed) for seed in seeds])
+    state = eqx.filter_jit(jax.vmap(training.init))(keys)
+    return _run(training, state, folders, config.total_steps, console)
+
+
+def resume(path: Path, total_steps: int | None = None, console: Console | None = None) -> Outcome:
+    """Continue one run from its newest checkpoint, to `total_steps` or as configured."""
+    console = console or Console(stderr=True)
+    config = folder.read_config(path)
+    if total_steps is not None:
+        config = replace(config, total_steps=total_steps)
+    training = build(config)
+    checkpoints = Checkpoints(path / "checkpoints", config.training.keep_checkpoints)
+    if checkpoints.latest >= config.total_steps:
+        raise UserError(
+            f"{path} has already done {checkpoints.latest} of {config.total_steps} steps: "
+            "give a larger --total-steps"
+        )
+    shape = jax.eval_shape(training.init, jax.random.key(0))
+    state = checkpoints.restore("state", shape)
+    folder.write_config(path, config)
+    return _run(
+        training,
+        jax.tree.map(lambda x: x[None], state),
+        [path],
+        config.total_steps,
+        console,
+        resumed=True,
+    )
+
+
+def build(config: Config) -> Training:
+    """The algorithm of a config in its environment."""
+    env = envs.make(config.env)
+    return Training(env, algorithms.make(config, env.spec))
+
+
+def _run(
+    training: Training,
+    states: TrainState,
+    folders: list[Path],
+    total_steps: int,
+    console: Console,
+    resumed: bool = False,
+) -> Outcome:
+    """Cycle until every seed has done `total_steps`. `states` has a leading axis of seeds."""
+    config = training.algorithm.config
+    keep = config.training.keep_checkpoints
+    checkpoints = [Checkpoints(path / "checkpoints", keep, create=True) for path in folders]
+    step = int(states.env_steps.min())
+    logs = [MetricsLog(path, resume_at=step if resumed else None) for path in folders]
+    program = _over_seeds(training.cycle, len(folders), donate=True)
+    diagnose = _over_seeds(
+        lambda state: training.algorithm.diagnose(
+            state.learner, state.replay, jax.random.fold_in(state.key, 0)
+        ),
+        len(folders),
+    )
+    saved, drawn, began = step, time.monotonic(), time.monotonic()
+    console.print("compiling (cached for the next run) ...", highlight=False)
+    with _Interruption() as interruption, Progress(
+        console, total_steps, training.env.spec.score_name, step
+    ) as progress:
+        while step < total_steps and not interruption.requested:
+            before, cycle_began = step, time.monotonic()
+            n_model, n_policy = updates_due(states, config)
+            states, metrics = program(states, n_model, n_policy)
+            step = int(states.env_steps.min())
+            if n_model and crossed(before, step, config.training.diagnose_every):
+                metrics |= diagnose(states)
+            metrics = jax.device_get(metrics)
+            seconds = time.monotonic() - cycle_began
+            for k, log in enumerate(logs):
+                row = describe({name: float(v[k]) for name, v in metrics.items()}, training.env.spec)
+                row["time/seconds"] = seconds
+                row["time/steps_per_second"] = (step - before) / seconds
+                log.write(int(states.env_steps[k]), row)
+                if k == 0:
+                    progress.update({"step": step, **row})
+            if crossed(saved, step, config.training.checkpoint_every):
+                saved = step
+                save(training, states, checkpoints)
+            if time.monotonic() - drawn > CURVES_EVERY:
+                drawn = time.monotonic()
+                draw_curves(folders, config)
+    save(training, states, checkpoints)
+    draw_curves(folders, config)
+    for log in logs:
+        log.close()
+    state = "interrupted" if interruption.requested else "finished"
+    console.print(
+        f"{state} at {step:,} steps after {duration(time.monotonic() - began)}", highlight=False
+    )
+    for path in folders:
+        hint = f"mabl resume {path}" if interruption.requested else f"mabl eval {path}"
+        console.print(f"next: {hint}", highlight=False, soft_wrap=True)
+    return Outcome(folders, interruption.requested)
+
+
+def updates_due(states: TrainState, config: Config) -> tuple[int, int]:
+    """Model and policy updates of the next cycle: none in prefill, then pretraining, then M and R."""
+    plan = config.training
+    rows_needed = max(plan.prefill_steps, config.world_model.batch_length)
+    if int(states.env_steps.min()) < rows_needed or int(states.replay.size.max()) < (
+        config.world_model.batch_length
+    ):
+        return 0, 0
+    if int(states.model_updates[0]) < plan.pretrain_updates:
+        return plan.pretrain_updates, 0
+    return plan.model_updates, plan.policy_updates
+
+
+def crossed(before: int, now: int, every: int) -> bool:
+    """True if a multiple of `every` lies in (before, now]."""
+    return now // every > before // every
+
+
+def describe(metrics: Row, spec: EnvSpec) -> Row:
+    """Sums over a cycle's episodes as means under the field's names."""
+    row = {name: value for name, value in metrics.items() if not name.startswith("episodes/")}
+    episodes = metrics["episodes/count"]
+    row["train/episodes"] = episodes
+    if episodes:
+        row["train/episode_return"] = metrics["episodes/return"] / episodes
+        row["train/episode_length"] = metrics["episodes/length"] / episodes
+        row[f"train/{spec.score_name}"] = metrics["episodes/score"] / episodes
+    return row
+
+
+def save(training: Training, states: TrainState, checkpoints: list[Checkpoints]) -> None:
+    """Checkpoint every seed in its own folder."""
+    for k, manager in enumerate(checkpoints):
+        state = jax.tree.map(lambda x, k=k: x[k], states)
+        policy = training.algorithm.policy(state.learner)
+        manager.save(int(state.env_steps), policy, state)
+
+
+def draw_curves(folders: list[Path], config: Config) -> None:
+    """Refresh curves.png of every seed."""
+    for path in folders:
+        curves.draw(read(path), f"{config.algo} on {config.env}", path / "curves.png")
+
+
+def _over_seeds(function: Any, n_seeds: int, donate: bool = False) -> Any:
+    """Compile a function of one seed's state for all seeds; a single seed is spared the vmap.
+
+    The batched trip counts stay scalars, so that loops are not masked.
+    """
+
+    def mapped(states: TrainState, *counts: Any) -> Any:
+        if n_seeds > 1:
+            axes = (0, *[None] * len(counts))
+            return jax.vmap(function, in_axes=axes)(states, *counts)
+        one = jax.tree.map(lambda x: x[0], states)
+        return jax.tree.map(lambda x: x[None], function(one, *counts))
+
+    return jax.jit(mapped, donate_argnums=0 if donate else ())
+
+
+class _Interruption:
+    """Turns the first Ctrl-C into a request to stop after the cycle; the second is a real one."""
+
+    requested = False
+
+    def __enter__(self) -> "_Interruption":
+        try:
+            self._previous = signal.signal(signal.SIGINT, self._handle)
+        except ValueError:  # not in the main thread: leave signals alone
+            self._previous = None
+        return self
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self.requested = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def __exit__(self, *_: object) -> None:
+        if self._previous is not None:
+            signal.signal(signal.SIGINT, self._previous)
