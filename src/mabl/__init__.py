@@ -1,8 +1,8 @@
 """MABL: sample-efficient multi-agent reinforcement learning with bi-level world models.
 
-    import mabl
-    outcome = mabl.train(mabl.preset("quick", "smax/3m", "mabl"))
-    policy = mabl.Policy.load(outcome.folders[0])
+import mabl
+outcome = mabl.train(mabl.preset("quick", "smax/3m", "mabl"))
+policy = mabl.Policy.load(outcome.folders[0])
 """
 
 from mabl.algorithms.config import Config

@@ -5,7 +5,7 @@ from difflib import get_close_matches
 
 
 class UserError(Exception):
-    """A mistake the user can mend; its message is one line: what came, what was expected, what to do."""
+    """A mistake the user can mend, said in one line: what came, what was expected, what to do."""
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:

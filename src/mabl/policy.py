@@ -64,9 +64,9 @@ def check_fits(trained: EnvSpec, played: EnvSpec) -> None:
 class Policy:
     """One agent's policy. It sees its own observation and holds its own latent state, nothing else.
 
-        policy = Policy.load("runs/smax/3m/mabl/seed_0/20260101-120000")
-        policy.reset()                        # at the start of an episode
-        action = policy.act(obs, available)   # once a step
+    policy = Policy.load("runs/smax/3m/mabl/seed_0/20260101-120000")
+    policy.reset()                        # at the start of an episode
+    action = policy.act(obs, available)   # once a step
     """
 
     def __init__(self, executor: LocalExecutor, seed: int = 0):
@@ -92,7 +92,7 @@ class Policy:
         self._is_first = True
 
     def act(self, obs: ArrayLike, available: ArrayLike | None = None) -> int | np.ndarray:
-        """The action at this observation `[O]`, given which actions are available `[A]` (None: all).
+        """The action at an observation `[O]`, of those available `[A]` (None: all).
 
         Raises UserError if the sizes are not those that the policy was trained with.
         """
@@ -112,7 +112,7 @@ class Policy:
         action = np.asarray(self._prev_action)
         return int(action) if action.ndim == 0 else action
 
-    def _act_once(self, level, prev_action, obs, available, is_first, key):  # noqa: ANN001
+    def _act_once(self, level, prev_action, obs, available, is_first, key):
         executor = self._executor
         return act_alone(
             executor.policy,

@@ -1,4 +1,4 @@
-"""The configuration of a run, composed of what each package owns. Units: joint environment steps."""
+"""The configuration of a run, composed of what each package owns. Steps are joint steps."""
 
 import types
 import typing
@@ -76,8 +76,8 @@ class Config:
         shortest = self.training.replay_capacity // self.training.num_envs
         if shortest < self.world_model.batch_length:
             raise UserError(
-                f"--training.replay-capacity {self.training.replay_capacity} leaves {shortest} rows "
-                f"for each of {self.training.num_envs} environments: give at least "
+                f"--training.replay-capacity {self.training.replay_capacity} leaves each of "
+                f"{self.training.num_envs} environments {shortest} rows: give at least "
                 f"{self.world_model.batch_length * self.training.num_envs}"
             )
 
@@ -94,7 +94,9 @@ def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
     for name in data:
         if name not in names:
             raise unknown_name("config field", f"{path}{name}", (f"{path}{n}" for n in names))
-    return cls(**{name: _value(hints[name], value, f"{path}{name}") for name, value in data.items()})
+    return cls(
+        **{name: _value(hints[name], value, f"{path}{name}") for name, value in data.items()}
+    )
 
 
 def _value(hint: Any, value: Any, path: str) -> Any:

@@ -13,9 +13,7 @@ from mabl.world_models.heads import Predictions
 OPEN_LOOP_STEPS = (1, 5, 15)
 
 
-def diagnose(
-    model: WorldModel, rows: TimeStep, key: PRNGKey, action_space: ActionSpace
-) -> Metrics:
+def diagnose(model: WorldModel, rows: TimeStep, key: PRNGKey, action_space: ActionSpace) -> Metrics:
     """Diagnostics on real sequences `[B, T]`, T > 15.
 
     `posterior` metrics decode the latent that has seen the row; `prior` ones the latent predicted
@@ -23,7 +21,7 @@ def diagnose(
     relative: 1 is as bad as always predicting the mean, 0 is perfect. Everything stays within
     episodes.
     """
-    batch, length = rows.is_first.shape
+    batch = rows.is_first.shape[0]
     key_observe, key_imagine = jax.random.split(key)
     latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
         model, rows, jax.random.split(key_observe, batch)
@@ -37,9 +35,7 @@ def diagnose(
         ),
         "world_model/reward_on_wins": masked_mean(posterior.reward.mean(-1), wins),
         "world_model/reward_on_wins_real": masked_mean(rows.reward.mean(-1), wins),
-        "world_model/terminated_accuracy": (
-            (posterior.terminated > 0) == rows.terminated
-        ).mean(),
+        "world_model/terminated_accuracy": ((posterior.terminated > 0) == rows.terminated).mean(),
         "world_model/available_accuracy": ((posterior.available > 0) == rows.available).mean(),
     }
     ahead = open_loop(model, latents, rows, key_imagine, action_space, max(OPEN_LOOP_STEPS))

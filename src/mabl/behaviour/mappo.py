@@ -65,14 +65,16 @@ class MAPPOConfig:
     """Start states drawn from the posterior states of a batch; None: all, as in the paper."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "hidden", "n_hidden", "n_heads", "n_epochs", "batch_size", "n_starts")
+        require_positive(
+            self, "hidden", "n_hidden", "n_heads", "n_epochs", "batch_size", "n_starts"
+        )
         require_positive(self, "actor_learning_rate", "critic_learning_rate", "grad_clip", "clip")
         require_between(self, 0, 1, "gamma", "gae_lambda", "ent_decay")
         require_between(self, 0, inf, "actor_weight_decay", "ent_coef", "value_coef")
         require_between(self, 2, inf, "horizon")
         if self.hidden % self.n_heads:
             raise UserError(
-                f"--mappo.hidden is {self.hidden}: give a multiple of --mappo.n-heads {self.n_heads}"
+                f"--mappo.hidden is {self.hidden}: give a multiple of its {self.n_heads} heads"
             )
 
 
@@ -114,9 +116,7 @@ def optimisers(
     return actor, critic
 
 
-def init(
-    config: MAPPOConfig, n_actor: int, n_critic: int, n_actions: int, key: PRNGKey
-) -> MAPPO:
+def init(config: MAPPOConfig, n_actor: int, n_critic: int, n_actions: int, key: PRNGKey) -> MAPPO:
     """Fresh networks for features of sizes F = `n_actor` and G = `n_critic`."""
     key_actor, key_critic = jax.random.split(key)
     actor = Actor(
@@ -159,8 +159,7 @@ def experience(
     advantage = target - value[:-1]
     metrics = {
         "behaviour/imagined_reward": (reached * reward).sum() / reached.sum(),
-        "behaviour/imagined_return": (start_weight * target[0].mean(-1)).sum()
-        / start_weight.sum(),
+        "behaviour/imagined_return": (start_weight * target[0].mean(-1)).sum() / start_weight.sum(),
         "behaviour/value": (reached * value[:-1]).sum() / reached.sum(),
         "behaviour/advantage_std": advantage.std(),
     }

@@ -1,0 +1,1 @@
+"""Environments: one interface, one adapter for each family."""

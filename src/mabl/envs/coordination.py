@@ -57,9 +57,7 @@ class CoordinationEnv:
         state = env_state._replace(t=env_state.t + 1, earned=env_state.earned + reward)
         return state, self._row(state, action.astype(jnp.int32), reward)
 
-    def _row(
-        self, state: CoordinationState, action: Int[Array, "N"], reward: Array
-    ) -> TimeStep:
+    def _row(self, state: CoordinationState, action: Int[Array, "N"], reward: Array) -> TimeStep:
         cue = jax.nn.one_hot(state.cue, N_CUES)
         time = jnp.float32(state.t / STEPS)[None]
         seen = jnp.concatenate([jnp.where(state.t == 0, cue, 0.0), time])

@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper as a pure function of (config, key): one cycle is one compiled program."""
+"""Algorithm 1 of the paper as a pure function of (config, key); a cycle is one compiled program."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -91,9 +91,7 @@ class Training(NamedTuple):
         one_episode = config.collect_steps is None
         n_rows = config.collect_steps or self.env.spec.episode_limit + 1
         return jax.vmap(
-            lambda collector, key: rollout(
-                self.env, executor, collector, key, n_rows, one_episode
-            )
+            lambda collector, key: rollout(self.env, executor, collector, key, n_rows, one_episode)
         )(collectors, jax.random.split(key, config.num_envs))
 
     def store(self, replay: Replay, collected: Rollout) -> Replay:
@@ -126,7 +124,7 @@ def repeat(
     key: PRNGKey,
     n: Int[Array, ""],
 ) -> tuple[Any, Metrics]:
-    """Apply `update` n times; n may be traced, so that prefill, pretraining and cycles share a program."""
+    """Apply `update` n times; a traced n lets prefill, pretraining and cycles share a program."""
     shapes = jax.eval_shape(update, carry, key)[1]
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 

@@ -1,5 +1,6 @@
 """What a person sees while a run goes on: a live panel on a terminal, plain lines elsewhere."""
 
+import math
 import time
 from collections import deque
 from types import TracebackType
@@ -96,7 +97,7 @@ class Progress:
 
 def duration(seconds: float) -> str:
     """Seconds as `4:05` or `1:04:05`; `?` if unknown."""
-    if not seconds == seconds or seconds == float("inf"):
+    if not math.isfinite(seconds):
         return "?"
     minutes, rest = divmod(int(max(seconds, 0)), 60)
     hours, minutes = divmod(minutes, 60)

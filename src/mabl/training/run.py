@@ -1,6 +1,5 @@
 """A training run from start to finish: folders, progress, metrics, checkpoints, interruption."""
 
-import os
 import signal
 import time
 from dataclasses import dataclass, replace
@@ -11,7 +10,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from rich.console import Console
 
 from mabl.algorithms import registry as algorithms
@@ -21,11 +19,11 @@ from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
 from mabl.replay import check_memory
 from mabl.runs import folder
-from mabl.training import curves
 from mabl.runs.checkpoint import Checkpoints
+from mabl.runs.metrics import MetricsLog, Row, read
+from mabl.training import curves
 from mabl.training.loop import Training, TrainState
 from mabl.training.memory import free_memory, tree_bytes
-from mabl.runs.metrics import MetricsLog, Row, read
 from mabl.training.progress import Progress, duration
 
 CURVES_EVERY = 30.0
@@ -116,9 +114,10 @@ def _run(
     )
     saved, drawn, began = step, time.monotonic(), time.monotonic()
     console.print("compiling (cached for the next run) ...", highlight=False)
-    with _Interruption() as interruption, Progress(
-        console, total_steps, training.env.spec.score_name, step
-    ) as progress:
+    with (
+        _Interruption() as interruption,
+        Progress(console, total_steps, training.env.spec.score_name, step) as progress,
+    ):
         while step < total_steps and not interruption.requested:
             before, cycle_began = step, time.monotonic()
             n_model, n_policy = updates_due(states, config)
@@ -129,7 +128,9 @@ def _run(
             metrics = jax.device_get(metrics)
             seconds = time.monotonic() - cycle_began
             for k, log in enumerate(logs):
-                row = describe({name: float(v[k]) for name, v in metrics.items()}, training.env.spec)
+                row = describe(
+                    {name: float(v[k]) for name, v in metrics.items()}, training.env.spec
+                )
                 row["time/seconds"] = seconds
                 row["time/steps_per_second"] = (step - before) / seconds
                 log.write(int(states.env_steps[k]), row)
@@ -156,7 +157,7 @@ def _run(
 
 
 def updates_due(states: TrainState, config: Config) -> tuple[int, int]:
-    """Model and policy updates of the next cycle: none in prefill, then pretraining, then M and R."""
+    """Model and policy updates of the next cycle: none in prefill, pretraining, then M and R."""
     plan = config.training
     rows_needed = max(plan.prefill_steps, config.world_model.batch_length)
     if int(states.env_steps.min()) < rows_needed or int(states.replay.size.max()) < (

@@ -31,7 +31,7 @@ class WorldModelConfig:
     n_classes: int = 32
     """Classes of each categorical."""
     agent_prior_input: Literal["prior", "posterior"] = "prior"
-    """Which global sample conditions the agent prior in training (sec. 3.2: prior; app. A: posterior)."""
+    """Global sample behind the agent prior in training (sec. 3.2: prior, app. A: posterior)."""
     reward_input: Literal["agent", "both"] = "agent"
     """What the reward predictor sees: (z_agent, h_agent) as in the paper, or both levels."""
     reward_loss: Literal["huber", "mse"] = "huber"

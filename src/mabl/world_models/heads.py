@@ -1,13 +1,13 @@
 """Observation model and auxiliary components (section 3.1.2): what a latent says of the world."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mabl.nets.mlp import MLP
 from mabl.types import PRNGKey
-from typing import NamedTuple
 
 
 class Predictions(NamedTuple):

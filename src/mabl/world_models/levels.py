@@ -37,14 +37,12 @@ class Recurrent(eqx.Module):
 
 
 class Categoricals(eqx.Module):
-    """A network that outputs the logits of K categoricals with C classes: a prior or a posterior."""
+    """Logits of K categoricals with C classes: a prior or a posterior."""
 
     mlp: MLP
     n_classes: int = eqx.field(static=True)
 
-    def __init__(
-        self, n_in: int, hidden: int, n_categoricals: int, n_classes: int, key: PRNGKey
-    ):
+    def __init__(self, n_in: int, hidden: int, n_categoricals: int, n_classes: int, key: PRNGKey):
         self.mlp = MLP(n_in, n_categoricals * n_classes, hidden, 1, key)
         self.n_classes = n_classes
 

@@ -16,7 +16,7 @@ from mabl.world_models.levels import AgentFilter, Categoricals, Level, Recurrent
 
 
 class Latent(NamedTuple):
-    """Both levels of every agent; fields `[N, ...]`, or without N inside the per-agent functions."""
+    """Both levels of every agent `[N, ...]`, or of one inside the per-agent functions."""
 
     agent: Level
     global_: Level
@@ -130,9 +130,7 @@ class MABL(eqx.Module):
 
         return jax.vmap(prior_agent)(latent, jax.random.split(key, self.spec.n_agents))
 
-    def imagine(
-        self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey
-    ) -> Latent:
+    def imagine(self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey) -> Latent:
         """Prior latents of the next row after the joint (encoded) action: no observation, no state.
 
         h_{t+1} as in `observe`, then z^g ~ p(z^g | h^g) and z^a ~ p(z^a | h^a, z^g).
