@@ -21,7 +21,7 @@ def require_positive(config: object, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
         if value is not None and not value > 0:
-            raise _out_of_range(name, value, "a number above 0")
+            raise _out_of_range(config, name, value, "a number above 0")
 
 
 def require_between(config: object, low: float, high: float, *names: str) -> None:
@@ -29,8 +29,9 @@ def require_between(config: object, low: float, high: float, *names: str) -> Non
     for name in names:
         value = getattr(config, name)
         if not low <= value <= high:
-            raise _out_of_range(name, value, f"a number from {low:g} to {high:g}")
+            raise _out_of_range(config, name, value, f"a number from {low:g} to {high:g}")
 
 
-def _out_of_range(name: str, value: object, expected: str) -> UserError:
-    return UserError(f"--{name.replace('_', '-')} is {value!r}: give {expected}")
+def _out_of_range(config: object, name: str, value: object, expected: str) -> UserError:
+    flag = f"{getattr(config, 'FLAG_PREFIX', '')}{name}".replace("_", "-")
+    return UserError(f"--{flag} is {value!r}: give {expected}")

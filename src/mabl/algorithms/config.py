@@ -5,7 +5,7 @@ import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from math import inf
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 from mabl.behaviour.mappo import MAPPOConfig
 from mabl.errors import UserError, require_between, require_positive, unknown_name
@@ -17,6 +17,8 @@ T = TypeVar("T")
 @dataclass(frozen=True)
 class TrainingConfig:
     """How Algorithm 1 alternates. Defaults are the paper's for SMAC (Tables 2 and 3)."""
+
+    FLAG_PREFIX: ClassVar[str] = "training."
 
     num_envs: int = 1
     """Environments that collect side by side."""

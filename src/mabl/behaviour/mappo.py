@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import inf
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,6 +22,8 @@ from mabl.types import Metrics, PRNGKey, Trajectory
 @dataclass(frozen=True)
 class MAPPOConfig:
     """Actor, critic and PPO. Defaults are the paper's (Tables 3 and 4)."""
+
+    FLAG_PREFIX: ClassVar[str] = "mappo."
 
     hidden: int = 256
     """Width of actor and critic."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import inf
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,8 @@ L = TypeVar("L")
 @dataclass(frozen=True)
 class WorldModelConfig:
     """Sizes and losses of the world model. Defaults are the paper's for SMAC (Table 2)."""
+
+    FLAG_PREFIX: ClassVar[str] = "world-model."
 
     hidden: int = 256
     """Width of hidden layers and of the deterministic embeddings h."""
