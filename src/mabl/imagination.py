@@ -4,7 +4,7 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from mabl.behaviour.actor import Actor
 from mabl.envs.base import ActionSpace
@@ -19,15 +19,17 @@ def imagine_trajectory(
     actor: Actor,
     start: L,
     available: Bool[Array, "N A"],
+    weight: Float[Array, ""],
     key: PRNGKey,
     horizon: int,
     action_space: ActionSpace,
+    sample_availability: bool = True,
 ) -> Trajectory:
     """Roll the policy through the model from one posterior latent; no batch axis.
 
     Row 0 is the start, with its real availability; each of the `horizon - 1` further rows is a
-    prior sample, its availability drawn from the model. No gradient flows: PPO's epochs run on
-    these rows as data.
+    prior sample, its availability drawn from the model (or its mode). `weight` says how much the start counts. No
+    gradient flows: PPO's epochs run on these rows as data.
     """
 
     def step(carry: tuple[L, Array], key: PRNGKey) -> tuple[tuple[L, Array], tuple]:
@@ -37,21 +39,30 @@ def imagine_trajectory(
         action = policy.sample(key_action)
         next_latent = model.imagine(latent, action_space.encode(action), key_latent)
         predicted = model.predict(next_latent)
-        next_available = jax.random.bernoulli(key_available, jax.nn.sigmoid(predicted.available))
-        row = (
-            (model.actor_features(latent), model.critic_features(latent), available),
-            (
-                action,
-                policy.log_prob(action),
-                predicted.reward,
-                1 - jax.nn.sigmoid(predicted.terminated),
-            ),
+        threshold = (
+            jax.random.uniform(key_available, available.shape) if sample_availability else 0.5
         )
-        return (next_latent, next_available), row
+        next_available = jax.nn.sigmoid(predicted.available) > threshold
+        seen = (model.actor_features(latent), model.critic_features(latent), available)
+        continues = 1 - jax.nn.sigmoid(predicted.terminated)
+        done = (action, policy.log_prob(action), predicted.reward, continues)
+        return (next_latent, next_available), (seen, done)
 
-    (last, last_available), (seen, done) = jax.lax.scan(
-        step, (start, available), jax.random.split(key, horizon - 1)
-    )
+    keys = jax.random.split(key, horizon - 1)
+    (last, last_available), (seen, done) = jax.lax.scan(step, (start, available), keys)
     final = (model.actor_features(last), model.critic_features(last), last_available)
     seen = jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), seen, final)
-    return jax.lax.stop_gradient(Trajectory(*seen, *done))
+    actor_features, critic_features, availables = seen
+    action, log_prob, reward, continues = done
+    survived = jnp.concatenate([jnp.ones_like(continues[:1]), continues[:-1]])
+    trajectory = Trajectory(
+        actor_features=actor_features,
+        critic_features=critic_features,
+        available=availables,
+        action=action,
+        log_prob=log_prob,
+        reward=reward,
+        continues=continues,
+        weight=weight * jnp.cumprod(survived, axis=0),
+    )
+    return jax.lax.stop_gradient(trajectory)

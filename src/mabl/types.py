@@ -69,6 +69,9 @@ class Trajectory(NamedTuple):
     """Predicted reward on arriving at row h + 1, in the replay's units."""
     continues: Float[Array, "H-1 B N"]
     """1 - p(terminated) at row h + 1."""
+    weight: Float[Array, "H-1 B N"]
+    """How much a row counts: the model's probability that the episode gets there; 0 where the start
+    ends an episode."""
 
 
 Metrics = dict[str, Any]

@@ -1,5 +1,7 @@
 """How good the world model is, in numbers a user can act on (logged as `world_model/...`)."""
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -7,25 +9,24 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import ActionSpace
 from mabl.types import Metrics, PRNGKey, TimeStep
-from mabl.world_models.base import WorldModel, observe_sequence
+from mabl.world_models.base import WorldModel
 from mabl.world_models.heads import Predictions
+
+L = TypeVar("L")
 
 OPEN_LOOP_STEPS = (1, 5, 15)
 
 
-def diagnose(model: WorldModel, rows: TimeStep, key: PRNGKey, action_space: ActionSpace) -> Metrics:
-    """Diagnostics on real sequences `[B, T]`, T > 15.
+def diagnose(
+    model: WorldModel[L], latents: L, rows: TimeStep, key: PRNGKey, action_space: ActionSpace
+) -> Metrics:
+    """Diagnostics on real sequences `[B, T]`, T > 15, and their posterior latents.
 
     `posterior` metrics decode the latent that has seen the row; `prior` ones the latent predicted
     for it one step before. Open-loop errors predict k steps ahead from real actions alone, and are
     relative: 1 is as bad as always predicting the mean, 0 is perfect. Everything stays within
     episodes.
     """
-    batch = rows.is_first.shape[0]
-    key_observe, key_imagine = jax.random.split(key)
-    latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
-        model, rows, jax.random.split(key_observe, batch)
-    )
     posterior = jax.vmap(jax.vmap(model.predict))(latents)
     wins = jnp.nan_to_num(rows.score) > 0
     metrics = {
@@ -38,15 +39,14 @@ def diagnose(model: WorldModel, rows: TimeStep, key: PRNGKey, action_space: Acti
         "world_model/terminated_accuracy": ((posterior.terminated > 0) == rows.terminated).mean(),
         "world_model/available_accuracy": ((posterior.available > 0) == rows.available).mean(),
     }
-    ahead = open_loop(model, latents, rows, key_imagine, action_space, max(OPEN_LOOP_STEPS))
-    metrics["world_model/reward_unexplained_prior"] = open_loop_error(
-        ahead.reward[..., None], rows.reward[..., None], rows, 1
-    )
+    ahead = open_loop(model, latents, rows, key, action_space, max(OPEN_LOOP_STEPS))
+    ahead_reward, reward = ahead.reward[..., None], rows.reward[..., None]
     for k in OPEN_LOOP_STEPS:
         metrics[f"world_model/open_loop_obs_{k}"] = open_loop_error(ahead.obs, rows.obs, rows, k)
         metrics[f"world_model/open_loop_reward_{k}"] = open_loop_error(
-            ahead.reward[..., None], rows.reward[..., None], rows, k
+            ahead_reward, reward, rows, k
         )
+    metrics["world_model/reward_unexplained_prior"] = metrics["world_model/open_loop_reward_1"]
     return metrics
 
 

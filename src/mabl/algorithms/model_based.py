@@ -10,7 +10,7 @@ from einops import rearrange
 from jaxtyping import Array, Float
 
 from mabl.algorithms.config import Config
-from mabl.algorithms.diagnostics import OPEN_LOOP_STEPS, diagnose
+from mabl.algorithms.diagnostics import OPEN_LOOP_STEPS, diagnose, masked_mean
 from mabl.behaviour import mappo
 from mabl.behaviour.mappo import MAPPO
 from mabl.envs.base import EnvSpec
@@ -19,6 +19,9 @@ from mabl.imagination import imagine_trajectory
 from mabl.replay import Replay, sample_sequences
 from mabl.types import Metrics, PRNGKey, TimeStep, is_last
 from mabl.world_models.base import WorldModel, model_loss, observe_sequence
+
+N_DIAGNOSED = 128
+"""Sequences that diagnostics look at."""
 
 
 class Learner(NamedTuple):
@@ -85,26 +88,40 @@ class ModelBased(NamedTuple):
         )
         start, available, weight = starts((latents, rows), key_start, config.n_starts)
         trajectory = jax.vmap(
-            lambda start, available, key: imagine_trajectory(
+            lambda start, available, weight, key: imagine_trajectory(
                 learner.model,
                 learner.behaviour.actor,
                 start,
                 available,
+                weight,
                 key,
                 config.horizon,
                 self.spec.action_space,
+                config.sample_availability,
             ),
             out_axes=1,
-        )(start, available, jax.random.split(key_imagine, weight.shape[0]))
-        behaviour, metrics = mappo.update(learner.behaviour, trajectory, weight, key_ppo, config)
+        )(start, available, weight, jax.random.split(key_imagine, weight.shape[0]))
+        behaviour, metrics = mappo.update(learner.behaviour, trajectory, key_ppo, config)
         return learner._replace(behaviour=behaviour), metrics
 
     def diagnose(self, learner: Learner, replay: Replay, key: PRNGKey) -> Metrics:
-        """How well the world model predicts sequences of the replay."""
-        key_sample, key_diagnose = jax.random.split(key)
+        """How well the world model predicts sequences of the replay, and what the critic expects.
+
+        `behaviour/value_at_reset` is in the environment's units: it compares with episode returns.
+        """
+        key_sample, key_observe, key_diagnose = jax.random.split(key, 3)
         length = max(OPEN_LOOP_STEPS) + 5
-        rows = sample_sequences(replay, key_sample, 64, length)
-        return diagnose(learner.model, rows, key_diagnose, self.spec.action_space)
+        rows = sample_sequences(replay, key_sample, N_DIAGNOSED, length)
+        latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
+            learner.model, rows, jax.random.split(key_observe, N_DIAGNOSED)
+        )
+        metrics = diagnose(learner.model, latents, rows, key_diagnose, self.spec.action_space)
+        features = jax.vmap(jax.vmap(learner.model.critic_features))(latents)
+        value = jax.vmap(jax.vmap(learner.behaviour.critic))(features).mean(-1)
+        metrics["behaviour/value_at_reset"] = (
+            masked_mean(value, rows.is_first) / self.config.training.reward_scale
+        )
+        return metrics
 
     def _optimiser(self) -> optax.GradientTransformation:
         config = self.config.world_model

@@ -65,6 +65,8 @@ class MAPPOConfig:
     """Rows of an imagined trajectory, the start included."""
     n_starts: int | None = None
     """Start states drawn from the posterior states of a batch; None: all, as in the paper."""
+    sample_availability: bool = True
+    """Sample the availability of imagined actions, as in the paper, or take its mode."""
 
     def __post_init__(self) -> None:
         require_positive(
@@ -136,48 +138,38 @@ def init(config: MAPPOConfig, n_actor: int, n_critic: int, n_actions: int, key: 
 
 
 def experience(
-    critic: Critic, trajectory: Trajectory, start_weight: Float[Array, " B"], config: MAPPOConfig
+    critic: Critic, trajectory: Trajectory, config: MAPPOConfig
 ) -> tuple[PPORows, Metrics]:
-    """Lambda-returns and advantages of imagined trajectories, flattened to joint rows.
-
-    A row weighs as much as the model believes that the episode reaches it.
-    """
-    reward = trajectory.reward
+    """Lambda-returns and advantages of trajectories, flattened to joint rows."""
+    reward, weight = trajectory.reward, trajectory.weight
     if config.team_reward:
         reward = jnp.broadcast_to(reward.mean(-1, keepdims=True), reward.shape)
     value = jax.vmap(jax.vmap(critic))(trajectory.critic_features)
     target = lambda_returns(
         reward, config.gamma * trajectory.continues, value[1:], config.gae_lambda
     )
-    reached = jnp.cumprod(
-        jnp.concatenate(
-            [
-                jnp.broadcast_to(start_weight[:, None], trajectory.continues[:1].shape[1:])[None],
-                trajectory.continues[:-1],
-            ]
-        ),
-        axis=0,
-    )
     advantage = target - value[:-1]
+
+    def mean(x: Array, weight: Array = weight) -> Array:
+        return (weight * x).sum() / (weight.sum() + 1e-8)
+
+    centred = advantage - mean(advantage)
+    std = jnp.sqrt(mean(centred**2))
     metrics = {
-        "behaviour/imagined_reward": (reached * reward).sum() / reached.sum(),
-        "behaviour/imagined_return": (start_weight * target[0].mean(-1)).sum() / start_weight.sum(),
-        "behaviour/value": (reached * value[:-1]).sum() / reached.sum(),
-        "behaviour/advantage_std": advantage.std(),
+        "behaviour/imagined_reward": mean(reward),
+        "behaviour/imagined_return": mean(target[0], weight[0]),
+        "behaviour/value": mean(value[:-1]),
+        "behaviour/advantage_std": std,
     }
-    if config.normalise_advantage:
-        mean = (reached * advantage).sum() / reached.sum()
-        variance = (reached * (advantage - mean) ** 2).sum() / reached.sum()
-        advantage = (advantage - mean) / (jnp.sqrt(variance) + 1e-5)
     rows = PPORows(
         trajectory.actor_features[:-1],
         trajectory.critic_features[:-1],
         trajectory.available[:-1],
         trajectory.action,
         trajectory.log_prob,
-        advantage,
+        centred / (std + 1e-5) if config.normalise_advantage else advantage,
         target,
-        reached,
+        weight,
     )
     return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
 
@@ -213,15 +205,11 @@ def critic_loss(
 def update(
     mappo: MAPPO,
     trajectory: Trajectory,
-    start_weight: Float[Array, " B"],
     key: PRNGKey,
     config: MAPPOConfig,
 ) -> tuple[MAPPO, Metrics]:
-    """`n_epochs` of minibatch PPO on one set of imagined trajectories (Algorithm 1, lines 12-13).
-
-    `start_weight` is 0 for starts that must not count (terminal rows), else 1.
-    """
-    rows, metrics = experience(mappo.critic, trajectory, start_weight, config)
+    """`n_epochs` of minibatch PPO on one set of trajectories (Algorithm 1, lines 12-13)."""
+    rows, metrics = experience(mappo.critic, trajectory, config)
     n_rows = rows.target.shape[0]
     batch_size = min(config.batch_size, n_rows)
     n_batches = n_rows // batch_size

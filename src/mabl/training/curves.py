@@ -11,7 +11,10 @@ matplotlib.use("agg")
 
 PANELS = {
     "score of training episodes": ("train/win_rate", "train/score"),
-    "return: real and imagined": ("train/episode_return", "behaviour/imagined_return"),
+    "return: real, and the critic's at resets": (
+        "train/episode_return",
+        "behaviour/value_at_reset",
+    ),
     "entropy of the policy (nats)": ("behaviour/entropy",),
     "KL (nats)": ("world_model/kl_agent", "world_model/kl_global"),
     "reward variance unexplained": (

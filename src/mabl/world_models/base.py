@@ -35,7 +35,8 @@ class WorldModelConfig:
     agent_prior_input: Literal["prior", "posterior"] = "prior"
     """Global sample behind the agent prior in training (sec. 3.2: prior, app. A: posterior)."""
     reward_input: Literal["agent", "both"] = "agent"
-    """What the reward predictor sees: (z_agent, h_agent) as in the paper, or both levels."""
+    """What imagination's reward predictor sees: (z_agent, h_agent) as in the paper, or both levels;
+    then the agent's own predictor is trained beside it."""
     reward_loss: Literal["huber", "mse"] = "huber"
     """Likelihood of the reward: smooth L1 with delta 1, or half the squared error."""
     kl_reduction: Literal["mean", "sum"] = "mean"
@@ -156,6 +157,10 @@ def model_loss(
         .mean(),
         "action": (acted * action_loss(predicted.action, rows.prev_action, action_space)).mean(),
     }
+    if config.reward_input == "both":
+        losses["agent_reward"] = reward_loss(
+            predicted.agent_reward, rows.reward, config.reward_loss
+        ).mean()
     for level in posterior:
         losses[f"kl_{level}"] = (
             config.kl_weight

@@ -15,6 +15,9 @@ class Predictions(NamedTuple):
 
     obs: Float[Array, "*b O"]
     reward: Float[Array, "*b"]
+    """What imagination uses."""
+    agent_reward: Float[Array, "*b"]
+    """From the agent level alone; the same number where that is what imagination uses."""
     terminated: Float[Array, "*b"]
     """Logit of p(terminated)."""
     available: Float[Array, "*b A"]
@@ -24,10 +27,14 @@ class Predictions(NamedTuple):
 
 
 class Heads(eqx.Module):
-    """The five decoders of one agent: two hidden layers each (Table 2)."""
+    """The decoders of one agent: two hidden layers each (Table 2).
+
+    With `both_levels_reward` a second reward predictor sees both levels; ADR 4 says why.
+    """
 
     obs: MLP
-    reward: MLP
+    agent_reward: MLP
+    full_reward: MLP | None
     terminated: MLP
     available: MLP
     action: MLP
@@ -35,31 +42,31 @@ class Heads(eqx.Module):
     def __init__(
         self,
         agent_dim: int,
-        reward_dim: int,
         full_dim: int,
         obs_dim: int,
         action_dim: int,
         hidden: int,
         n_hidden: int,
+        both_levels_reward: bool,
         key: PRNGKey,
     ):
-        keys = jax.random.split(key, 5)
+        keys = jax.random.split(key, 6)
         self.obs = MLP(agent_dim, obs_dim, hidden, n_hidden, keys[0])
-        self.reward = MLP(reward_dim, 1, hidden, n_hidden, keys[1])
+        self.agent_reward = MLP(agent_dim, 1, hidden, n_hidden, keys[1])
         self.terminated = MLP(full_dim, 1, hidden, n_hidden, keys[2])
         self.available = MLP(full_dim, action_dim, hidden, n_hidden, keys[3])
         self.action = MLP(full_dim, action_dim, hidden, n_hidden, keys[4])
+        self.full_reward = (
+            MLP(full_dim, 1, hidden, n_hidden, keys[5]) if both_levels_reward else None
+        )
 
-    def __call__(
-        self,
-        agent: Float[Array, " F"],
-        reward_input: Float[Array, " R"],
-        full: Float[Array, " G"],
-    ) -> Predictions:
-        """Decode one agent's latents: the agent level, the reward's input, and all levels."""
+    def __call__(self, agent: Float[Array, " F"], full: Float[Array, " G"]) -> Predictions:
+        """Decode one agent's latents: its own level, and all levels."""
+        agent_reward = self.agent_reward(agent)[0]
         return Predictions(
             obs=self.obs(agent),
-            reward=self.reward(reward_input)[0],
+            reward=self.full_reward(full)[0] if self.full_reward else agent_reward,
+            agent_reward=agent_reward,
             terminated=self.terminated(full)[0],
             available=self.available(full),
             action=self.action(full),

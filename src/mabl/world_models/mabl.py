@@ -58,12 +58,12 @@ class MABL(eqx.Module):
         self.agent_prior = Categoricals(hidden + latent_dim, hidden, k, c, keys[5])
         self.heads = Heads(
             agent_dim=level_dim,
-            reward_dim={"agent": level_dim, "both": 2 * level_dim}[config.reward_input],
             full_dim=2 * level_dim,
             obs_dim=spec.obs_dim,
             action_dim=action_dim,
             hidden=hidden,
             n_hidden=config.n_hidden,
+            both_levels_reward=config.reward_input == "both",
             key=keys[6],
         )
 
@@ -154,10 +154,7 @@ class MABL(eqx.Module):
         o^i_t from (z^a, h^a); r^i_t likewise (`config.reward_input`); termination, availability and
         a^i_{t-1} from both levels.
         """
-        agent = self.actor_features(latent)
-        full = self.critic_features(latent)
-        reward_input = {"agent": agent, "both": full}[self.config.reward_input]
-        return jax.vmap(self.heads)(agent, reward_input, full)
+        return jax.vmap(self.heads)(self.actor_features(latent), self.critic_features(latent))
 
     def actor_features(self, latent: Latent) -> Float[Array, "N F"]:
         """(z^a, h^a): all that a policy may see (section 3.3)."""

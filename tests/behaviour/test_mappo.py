@@ -1,0 +1,363 @@
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mabl.algorithms.model_based import Learner, ModelBased, starts
+from mabl.algorithms.presets import preset
+from mabl.behaviour import mappo
+from mabl.behaviour.actor import MaskedCategorical
+from mabl.behaviour.mappo import MAPPOConfig
+from mabl.envs.coordination import CoordinationEnv
+from mabl.imagination import imagine_trajectory
+from mabl.replay import Replay, sample_sequences
+from mabl.training.loop import Training
+from mabl.types import Trajectory
+from mabl.world_models.base import observe_sequence
+from mabl.world_models.mabl import MABL
+
+TINY = MAPPOConfig(hidden=16, n_hidden=1, n_heads=2)
+
+
+def leaves(tree) -> list[np.ndarray]:
+    return [np.asarray(x) for x in jax.tree.leaves(tree)]
+
+
+def same(a, b) -> bool:
+    """Bitwise equality of all leaves."""
+    return all(np.array_equal(x, y) for x, y in zip(leaves(a), leaves(b), strict=True))
+
+
+@pytest.fixture(scope="module")
+def fresh() -> mappo.MAPPO:
+    return mappo.init(TINY, n_actor=5, n_critic=7, n_actions=4, key=jax.random.key(1))
+
+
+# --- the policy -------------------------------------------------------------------------------
+
+
+def test_masked_actions_have_probability_zero_and_the_rest_are_renormalised():
+    logits = jnp.log(jnp.array([1.0, 2.0, 3.0, 4.0]))
+    policy = MaskedCategorical.of(logits, jnp.array([True, False, True, False]))
+    assert_allclose(jnp.exp(policy.log_probs), [0.25, 0, 0.75, 0], rtol=1e-6)
+    assert float(jnp.exp(policy.log_probs[1])) == 0.0
+    assert policy.mode() == 2
+    assert_allclose(policy.log_prob(jnp.array(0)), np.log(0.25), rtol=1e-6)
+    # 1/4 ln 4 + 3/4 ln 4/3 = 0.562335; 0 log 0 counts as 0
+    assert_allclose(policy.entropy(), 0.562335, rtol=1e-5)
+
+
+def test_without_any_available_action_none_is_masked():
+    logits = jnp.log(jnp.array([[1.0, 3.0], [1.0, 3.0]]))
+    policy = MaskedCategorical.of(logits, jnp.array([[False, False], [True, False]]))
+    assert_allclose(jnp.exp(policy.log_probs), [[0.25, 0.75], [1, 0]], rtol=1e-6)
+
+
+def test_masking_keeps_gradients_finite():
+    def loss(logits):
+        policy = MaskedCategorical.of(logits, jnp.array([True, False, True]))
+        return policy.entropy() + policy.log_prob(jnp.array(0))
+
+    gradient = jax.grad(loss)(jnp.array([1.0, 2.0, 0.5]))
+    assert np.isfinite(gradient).all()
+    assert gradient[1] == 0
+
+
+def test_sampling_follows_the_probabilities():
+    policy = MaskedCategorical.of(
+        jnp.broadcast_to(jnp.log(jnp.array([1.0, 5.0, 3.0])), (8000, 3)),
+        jnp.broadcast_to(jnp.array([True, False, True]), (8000, 3)),
+    )
+    counts = np.bincount(policy.sample(jax.random.key(0)), minlength=3)
+    assert_allclose(counts / 8000, [0.25, 0, 0.75], atol=0.025)  # five standard errors
+
+
+# --- experience -------------------------------------------------------------------------------
+
+
+class ConstantCritic(NamedTuple):
+    value: float
+
+    def __call__(self, features: Array) -> Array:
+        return jnp.full(features.shape[0], self.value)
+
+
+def two_steps() -> Trajectory:
+    """Three rows, two transitions, one start, two agents; features show row and agent."""
+    rows = jnp.arange(3.0)[:, None, None, None]
+    return Trajectory(
+        actor_features=jnp.broadcast_to(rows, (3, 1, 2, 5)),
+        critic_features=jnp.broadcast_to(10 * rows, (3, 1, 2, 7)),
+        available=jnp.ones((3, 1, 2, 4), bool),
+        action=jnp.array([[[0, 1]], [[2, 3]]]),
+        log_prob=jnp.log(jnp.array([[[0.1, 0.2]], [[0.3, 0.4]]])),
+        reward=jnp.array([[[1.0, 3.0]], [[2.0, 2.0]]]),
+        continues=jnp.array([[[0.5, 0.5]], [[0.25, 0.25]]]),
+        weight=jnp.array([[[1.0, 1.0]], [[0.5, 0.5]]]),
+    )
+
+
+BY_HAND = replace(TINY, gamma=0.5, gae_lambda=0.5, normalise_advantage=False)
+
+
+def experience(config: MAPPOConfig, trajectory: Trajectory):
+    critic = ConstantCritic(2.0)
+    return mappo.experience(critic, trajectory, config)  # pyright: ignore[reportArgumentType]
+
+
+def test_experience_by_hand():
+    rows, metrics = experience(BY_HAND, two_steps())
+    # Team rewards 2 and 2; discounts 0.5 * 0.5 and 0.5 * 0.25; values 2.
+    # G_1 = 2 + 0.125 * 2 = 2.25, G_0 = 2 + 0.25 (0.5 * 2 + 0.5 * 2.25) = 2.53125
+    assert_allclose(rows.target, [[2.53125] * 2, [2.25] * 2])
+    assert_allclose(rows.advantage, [[0.53125] * 2, [0.25] * 2])
+    assert_allclose(rows.weight, [[1, 1], [0.5, 0.5]])
+    assert_array_equal(rows.action, [[0, 1], [2, 3]])
+    assert_allclose(jnp.exp(rows.log_prob), [[0.1, 0.2], [0.3, 0.4]], rtol=1e-6)
+    assert_array_equal(rows.actor_features[:, 0, 0], [0, 1])
+    assert_array_equal(rows.critic_features[:, 0, 0], [0, 10])
+    assert_allclose(metrics["behaviour/imagined_reward"], 2.0)
+    assert_allclose(metrics["behaviour/value"], 2.0)
+    assert_allclose(metrics["behaviour/imagined_return"], 2.53125)
+
+
+def test_without_team_reward_every_agent_keeps_its_own():
+    rows, _ = experience(replace(BY_HAND, team_reward=False), two_steps())
+    # G_1 = 2.25 for both; G_0 = 1 or 3 + 0.25 * 2.125 = 0.53125
+    assert_allclose(rows.target, [[1.53125, 3.53125], [2.25, 2.25]])
+
+
+def test_normalised_advantages_by_hand():
+    rows, _ = experience(replace(BY_HAND, normalise_advantage=True), two_steps())
+    # Weighted mean (0.53125 + 0.5 * 0.25) / 1.5 = 0.4375, deviations 0.09375 and -0.1875,
+    # variance (0.09375^2 + 0.5 * 0.1875^2) / 1.5 = 0.0175781, root 0.132583
+    assert_allclose(rows.advantage, [[0.70711] * 2, [-1.41421] * 2], rtol=2e-4)
+
+
+def random_trajectory(h: int, b: int, reward: Array | None = None) -> Trajectory:
+    keys = jax.random.split(jax.random.key(0), 6)
+    shape = (h - 1, b, 2)
+    return Trajectory(
+        actor_features=jax.random.normal(keys[0], (h, b, 2, 5)),
+        critic_features=jax.random.normal(keys[1], (h, b, 2, 7)),
+        available=jnp.ones((h, b, 2, 4), bool),
+        action=jax.random.randint(keys[2], shape, 0, 4),
+        log_prob=jnp.full(shape, jnp.log(0.25)),
+        reward=jax.random.normal(keys[3], shape) if reward is None else reward,
+        continues=jax.random.uniform(keys[4], shape),
+        weight=jax.random.uniform(keys[5], shape),
+    )
+
+
+def test_normalised_advantages_have_mean_zero_and_variance_one_under_the_weights():
+    config = replace(TINY, normalise_advantage=True, team_reward=False)
+    rows, _ = experience(config, random_trajectory(5, 8))
+    weight = rows.weight / rows.weight.sum()
+    assert_allclose((weight * rows.advantage).sum(), 0.0, atol=1e-5)
+    assert_allclose((weight * rows.advantage**2).sum(), 1.0, rtol=1e-3)
+
+
+def test_a_start_of_weight_zero_never_counts():
+    def metrics(reward_of_start_1):
+        trajectory = random_trajectory(5, 3)
+        _, metrics = experience(
+            BY_HAND,
+            trajectory._replace(
+                reward=trajectory.reward.at[:, 1].set(reward_of_start_1),
+                weight=trajectory.weight.at[:, 1].set(0.0),
+            ),
+        )
+        return {name: float(value) for name, value in metrics.items()}
+
+    assert metrics(0.0) == metrics(1e3)
+
+
+def test_losses_count_rows_by_their_weight(fresh):
+    rows, _ = experience(BY_HAND, random_trajectory(3, 4))
+    rows = rows._replace(weight=jnp.zeros_like(rows.weight).at[5, 1].set(0.3))
+    value = float(fresh.critic(rows.critic_features[5])[1])
+    loss, _ = mappo.critic_loss(fresh.critic, rows, 0.5)
+    assert_allclose(loss, 0.5 * (value - float(rows.target[5, 1])) ** 2, rtol=1e-5)
+    policy = jax.vmap(fresh.actor)(rows.actor_features[5], rows.available[5])
+    ratio = float(jnp.exp(policy.log_prob(rows.action[5]) - rows.log_prob[5])[1])
+    loss, _ = mappo.actor_loss(fresh.actor, rows, jnp.float32(0.0), 9.0)  # nothing is clipped
+    assert_allclose(loss, -ratio * float(rows.advantage[5, 1]), rtol=1e-5)
+
+
+# --- updates ----------------------------------------------------------------------------------
+
+
+def test_zero_advantages_leave_the_actor_alone_while_the_critic_learns(fresh):
+    # All rewards and all values equal, every transition ends the episode: advantages are equal,
+    # and normalised to zero. The critic is off by 1 everywhere.
+    trajectory = random_trajectory(3, 4, reward=jnp.ones((2, 4, 2)))
+    trajectory = trajectory._replace(continues=jnp.zeros((2, 4, 2)), weight=jnp.ones((2, 4, 2)))
+    critic = eqx.tree_at(lambda c: c.mlp.layers[-1].weight, fresh.critic, replace_fn=jnp.zeros_like)
+    config = replace(TINY, ent_coef=0.0, actor_weight_decay=0.0, batch_size=8)
+    before = fresh._replace(critic=critic, ent_coef=jnp.float32(0.0))
+    after, _ = mappo.update(before, trajectory, jax.random.key(0), config)
+    assert same(after.actor, before.actor)
+    assert not same(after.critic, before.critic)
+    value = jax.vmap(after.critic)(trajectory.critic_features[0])
+    assert (value > 0).all()  # on its way from 0 to 1
+
+
+def test_advantages_move_the_actor_towards_the_better_action(fresh):
+    # Action 1 pays 1, all others 0; episodes end at once.
+    trajectory = random_trajectory(2, 64)
+    trajectory = trajectory._replace(
+        reward=(trajectory.action == 1).astype(jnp.float32), continues=jnp.zeros((1, 64, 2))
+    )
+    config = replace(TINY, actor_learning_rate=1e-2, team_reward=False)
+
+    def probability(actor):
+        policy = jax.vmap(jax.vmap(actor))(trajectory.actor_features[0], trajectory.available[0])
+        return float(jnp.exp(policy.log_probs[..., 1]).mean())
+
+    after, _ = mappo.update(fresh, trajectory, jax.random.key(0), config)
+    assert probability(after.actor) > probability(fresh.actor) + 0.02
+
+
+def test_the_entropy_bonus_decays_with_every_minibatch(fresh):
+    # 2 transitions x 4 starts = 8 rows: two minibatches of 3 in each of 3 epochs
+    config = replace(TINY, batch_size=3, n_epochs=3)
+    trajectory = random_trajectory(3, 4)
+    after, metrics = mappo.update(fresh, trajectory, jax.random.key(0), config)
+    assert_allclose(after.ent_coef, 0.001 * 0.99998**6, rtol=1e-6)
+    assert metrics["behaviour/ent_coef"] == after.ent_coef
+
+
+def test_the_entropy_bonus_alone_makes_the_policy_more_uniform(fresh):
+    trajectory = random_trajectory(3, 16, reward=jnp.ones((2, 16, 2)))
+    rows, _ = experience(TINY, trajectory)
+    rows = rows._replace(advantage=jnp.zeros_like(rows.advantage))
+
+    def entropy(actor):
+        return float(mappo.actor_loss(actor, rows, jnp.float32(1.0), 0.2)[1]["behaviour/entropy"])
+
+    gradient, _ = eqx.filter_grad(mappo.actor_loss, has_aux=True)(
+        fresh.actor, rows, jnp.float32(1.0), 0.2
+    )
+    moved = eqx.apply_updates(fresh.actor, jax.tree.map(lambda g: -0.1 * g, gradient))
+    assert entropy(moved) > entropy(fresh.actor)
+
+
+# --- with a real world model ------------------------------------------------------------------
+
+
+class Setting(NamedTuple):
+    algorithm: ModelBased
+    learner: Learner
+    replay: Replay
+
+
+@pytest.fixture(scope="module")
+def coordination() -> Setting:
+    """A tiny MABL and a replay of random play."""
+    config = preset("quick", "test/coordination", "mabl")
+    config = replace(
+        config,
+        training=replace(config.training, num_envs=2, collect_steps=30, replay_capacity=60),
+        world_model=replace(
+            config.world_model,
+            hidden=16,
+            n_hidden=1,
+            n_categoricals=2,
+            n_classes=4,
+            batch_size=4,
+            batch_length=5,
+        ),
+        mappo=replace(config.mappo, hidden=16, n_hidden=1, n_heads=2, n_starts=None),
+    )
+    env = CoordinationEnv()
+    algorithm = ModelBased(MABL, env.spec, config)
+    training = Training(env, algorithm)
+
+    @eqx.filter_jit
+    def begin(key):
+        state = training.init(key)
+        _, collected = training.collect(state.learner, state.collectors, key)
+        return state.learner, training.store(state.replay, collected)
+
+    return Setting(algorithm, *begin(jax.random.key(0)))
+
+
+@pytest.fixture(scope="module")
+def imagined(coordination) -> Trajectory:
+    """Imagined trajectories, made as `update_policy` makes them."""
+    algorithm, learner, replay = coordination
+    config = algorithm.config
+
+    @eqx.filter_jit
+    def imagine(learner, replay):
+        rows = sample_sequences(replay, jax.random.key(1), 4, 5)
+        latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
+            learner.model, rows, jax.random.split(jax.random.key(2), 4)
+        )
+        start, available, weight = starts((latents, rows), jax.random.key(3), None)
+        trajectory = jax.vmap(
+            lambda start, available, weight, key: imagine_trajectory(
+                learner.model,
+                learner.behaviour.actor,
+                start,
+                available,
+                weight,
+                key,
+                config.mappo.horizon,
+                algorithm.spec.action_space,
+            ),
+            out_axes=1,
+        )(start, available, weight, jax.random.split(jax.random.key(4), 20))
+        return trajectory
+
+    return imagine(learner, replay)
+
+
+def test_the_first_ppo_ratio_is_one(coordination, imagined):
+    algorithm, learner, _ = coordination
+    horizon = algorithm.config.mappo.horizon
+    assert imagined.action.shape == (horizon - 1, 20, 2)
+    config = algorithm.config.mappo
+    rows, _ = mappo.experience(learner.behaviour.critic, imagined, config)
+    policy = jax.vmap(jax.vmap(learner.behaviour.actor))(rows.actor_features, rows.available)
+    assert_allclose(jnp.exp(policy.log_prob(rows.action) - rows.log_prob), 1.0, atol=1e-5)
+    _, metrics = mappo.actor_loss(
+        learner.behaviour.actor, rows, jnp.float32(0.0), algorithm.config.mappo.clip
+    )
+    assert metrics["behaviour/clip_fraction"] == 0
+    assert_allclose(metrics["behaviour/approx_kl"], 0, atol=1e-6)
+
+
+def test_imagined_actions_were_available(imagined):
+    trajectory = imagined
+    taken = np.take_along_axis(
+        np.asarray(trajectory.available[:-1]), np.asarray(trajectory.action)[..., None], -1
+    )[..., 0]
+    none_available = ~np.asarray(trajectory.available[:-1]).any(-1)
+    assert (taken | none_available).all()
+    assert (np.asarray(trajectory.available[0]) == [True, True, True, False]).all()
+
+
+def test_updating_the_policy_leaves_the_world_model_alone(coordination):
+    algorithm, learner, replay = coordination
+    after, metrics = eqx.filter_jit(algorithm.update_policy)(learner, replay, jax.random.key(0))
+    assert same((learner.model, learner.model_opt), (after.model, after.model_opt))
+    assert not same(learner.behaviour.actor, after.behaviour.actor)
+    assert not same(learner.behaviour.critic, after.behaviour.critic)
+    assert all(np.isfinite(v) for v in metrics.values())
+
+
+def test_updating_the_model_leaves_actor_and_critic_alone(coordination):
+    algorithm, learner, replay = coordination
+    after, metrics = eqx.filter_jit(algorithm.update_model)(learner, replay, jax.random.key(0))
+    assert same(learner.behaviour, after.behaviour)
+    pairs = zip(leaves(learner.model), leaves(after.model), strict=True)
+    changed = [not np.array_equal(before, now) for before, now in pairs]
+    assert all(changed)  # every parameter of the model is trained
+    assert all(np.isfinite(v) for v in metrics.values())

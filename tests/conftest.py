@@ -1,0 +1,18 @@
+"""Shared settings: mabl's warnings are errors, rank promotion raises, programs are cached."""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR",
+    str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mabl" / "jax-tests"),
+)
+
+import jax
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def pytest_configure(config):
+    config.addinivalue_line("filterwarnings", r"error:::mabl(\..*)?")

@@ -1,0 +1,188 @@
+"""The command line, as a person meets it: one line for a mistake, and runs that go on."""
+
+import json
+
+import pytest
+
+from mabl import cli
+
+TINY = [
+    "--env=test/coordination",
+    "--world-model.hidden=16",
+    "--world-model.n-categoricals=2",
+    "--world-model.n-classes=4",
+    "--world-model.batch-size=4",
+    "--mappo.hidden=16",
+    "--mappo.n-starts=16",
+    "--training.model-updates=2",
+    "--training.policy-updates=1",
+    "--training.prefill-steps=200",
+    "--training.pretrain-updates=3",
+    "--training.diagnose-every=300",
+]
+
+
+@pytest.fixture
+def mabl(monkeypatch, capsys):
+    """Runs a command in this process; returns exit code, stdout, stderr."""
+
+    def invoke(*arguments):
+        monkeypatch.setattr("sys.argv", ["mabl", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit_:
+            cli.main()
+        return exit_.value.code, *capsys.readouterr()
+
+    return invoke
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of 600 steps, made once."""
+    logdir = tmp_path_factory.mktemp("runs")
+    assert cli.run(["train", *TINY, "--total-steps=600", f"--logdir={logdir}"]) == 0
+    (folder,) = logdir.glob("test/coordination/mabl/seed_0/*")
+    return folder
+
+
+def rows_of(folder):
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if not k.startswith("time/")} for row in rows]
+
+
+MISTAKES = {
+    "environment": (["train", "--env", "smax/3n"], "unknown environment 'smax/3n': did you mean"),
+    "family": (["train", "--env", "smac/3m"], "unknown environment 'smac/3m'"),
+    "algorithm": (["train", "--algo", "mable"], "unknown algorithm 'mable': did you mean mabl?"),
+    "preset": (["train", "--preset", "quik"], "unknown preset 'quik': did you mean quick?"),
+    "command": (["trian"], "unknown command 'trian': did you mean train?"),
+    "range": (["train", "--mappo.gamma", "2"], "--mappo.gamma is 2.0: give a number from 0 to 1"),
+    "zero": (["train", "--total-steps", "0"], "--total-steps is 0: give a number above 0"),
+    "negative": (["train", "--training.model-updates=-1"], "--training.model-updates is -1"),
+    "capacity": (["train", "--training.replay-capacity=16"], "--training.replay-capacity 16"),
+    "heads": (["train", "--mappo.hidden=30"], "--mappo.hidden is 30: give a multiple of its 8"),
+    "no folder": (["eval", "nowhere"], "nowhere is not a run folder"),
+    "resume nothing": (["resume", "nowhere"], "nowhere is not a run folder"),
+    "nothing to do": (["eval"], "give either a run folder or --policy random|heuristic"),
+    "no environment": (["eval", "--policy", "random"], "--policy random needs --env"),
+    "no heuristic": (
+        ["eval", "--policy", "heuristic", "--env", "test/counting"],
+        "test/counting has no heuristic policy: use --policy random",
+    ),
+    "episodes": (
+        ["eval", "--policy=random", "--env=test/counting", "--episodes=0"],
+        "--episodes is 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_line_and_exit_code_2(mabl, name):
+    arguments, message = MISTAKES[name]
+    code, out, err = mabl(*arguments)
+    assert code == 2
+    assert err.startswith(f"mabl: {message}"), err
+    assert err.count("\n") == 1 and not out
+
+
+def test_a_misspelt_flag_is_explained(mabl):
+    code, _, err = mabl("train", "--mappo.gama", "0.9")
+    assert code == 2 and "--mappo.gamma" in err
+
+
+def test_a_logdir_that_cannot_be_written_is_named(mabl, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    code, _, err = mabl("train", *TINY, f"--logdir={tmp_path}/file")
+    assert code == 2 and "cannot write to" in err and "choose another --logdir" in err
+
+
+def test_a_replay_that_cannot_fit_is_refused_before_it_is_allocated(mabl, tmp_path):
+    huge = "--training.replay-capacity=1000000000000"
+    code, _, err = mabl("train", *TINY, huge, f"--logdir={tmp_path}")
+    assert code == 2 and "the replay needs" in err and not list(tmp_path.iterdir())
+
+
+def test_a_run_folder_holds_what_the_documentation_says(trained):
+    present = {path.name for path in trained.iterdir()}
+    assert present == {
+        "config.yaml",
+        "versions.yaml",
+        "metrics.jsonl",
+        "curves.png",
+        "tensorboard",
+        "checkpoints",
+    }
+    steps = [row["step"] for row in rows_of(trained)]
+    assert steps == sorted(set(steps)) and steps[-1] >= 600
+    last = rows_of(trained)[-1]
+    for name in ("train/episode_return", "world_model/kl_agent", "behaviour/entropy"):
+        assert name in last
+    assert any("world_model/open_loop_obs_15" in row for row in rows_of(trained))
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(trained, mabl, tmp_path):
+    import shutil
+
+    resumed = tmp_path / "run"
+    shutil.copytree(trained, resumed)
+    with (resumed / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 9999, "train/score": 1.0}\n{"step": 10')  # past the checkpoint; torn
+    assert mabl("resume", resumed, "--total-steps=1200")[0] == 0
+    assert mabl("train", *TINY, "--total-steps=1200", f"--logdir={tmp_path / 'whole'}")[0] == 0
+    (whole,) = (tmp_path / "whole").glob("test/coordination/mabl/seed_0/*")
+    assert rows_of(resumed) == rows_of(whole)
+
+
+def test_resuming_a_finished_run_says_so(trained, mabl):
+    code, _, err = mabl("resume", trained)
+    assert code == 2 and "has already done" in err and "larger --total-steps" in err
+
+
+def test_eval_prints_one_json_object(trained, mabl):
+    code, out, _ = mabl("eval", trained, "--episodes=10", "--json")
+    numbers = json.loads(out)
+    assert code == 0 and numbers["episodes"] == 10 and numbers["env"] == "test/coordination"
+    assert numbers["episode_length"] == 4.0 and numbers["episode_length_std"] == 0.0
+    assert 0 <= numbers["score"] <= 1 and numbers["episode_return"] == 4 * numbers["score"]
+    assert json.loads(mabl("eval", trained, "--episodes=10", "--json")[1]) == numbers
+    assert json.loads(mabl("eval", trained, "--sample", "--json")[1])["greedy"] is False
+
+
+def test_eval_in_another_environment_says_what_does_not_fit(trained, mabl):
+    code, _, err = mabl("eval", trained, "--env", "test/counting")
+    assert code == 2 and err == (
+        "mabl: test/counting has 4 observation features, the checkpoint expects 6: "
+        "pass --env test/coordination\n"
+    )
+
+
+def test_a_damaged_config_is_named(trained, mabl, tmp_path):
+    import shutil
+
+    copy = tmp_path / "run"
+    shutil.copytree(trained, copy)
+    text = (copy / "config.yaml").read_text()
+    for damage, message in (
+        (text.replace("gamma: 0.99", "gama: 0.99"), "unknown config field 'mappo.gama'"),
+        (text.replace("hidden: 16", "hidden: wide"), "config field world_model.hidden is 'wide'"),
+        ("{", "is not readable YAML"),
+    ):
+        (copy / "config.yaml").write_text(damage)
+        code, _, err = mabl("eval", copy)
+        assert code == 2 and message in err and err.count("\n") == 1
+
+
+def test_the_lists_name_everything(mabl):
+    code, out, _ = mabl("algos")
+    assert code == 0 and "mabl" in out
+    from mabl.envs import registry
+
+    code, out, _ = mabl("envs")
+    assert code == 0
+    assert all(row.name in out for row in registry.names())
+
+
+def test_help_is_readable(mabl):
+    code, out, _ = mabl("--help")
+    assert code == 0 and all(f"mabl {name}" in out for name in cli.COMMANDS)
+    code, out, _ = mabl("train", "--help")
+    assert code == 0 and "--total-steps" in out and "--mappo.ent-coef" in out

@@ -1,0 +1,420 @@
+"""Which parameters and inputs of MABL reach what, as section 3.1's equations demand."""
+
+from dataclasses import replace
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mabl.envs.base import Continuous, Discrete, EnvSpec
+from mabl.losses.kl import balanced_kl
+from mabl.types import TimeStep
+from mabl.world_models.base import WorldModelConfig, model_loss, observe_sequence, reward_loss
+from mabl.world_models.heads import Predictions
+from mabl.world_models.mabl import MABL
+
+SPEC = EnvSpec("stub", 3, 4, 5, Discrete(3), 10, "score")
+CONFIG = WorldModelConfig(hidden=16, n_hidden=1, n_categoricals=3, n_classes=4)
+GLOBAL = (
+    "state_encoder",
+    "global_recurrent",
+    "global_posterior",
+    "global_prior",
+    "agent_prior",
+)
+
+
+def build(**options) -> MABL:
+    return MABL(SPEC, replace(CONFIG, **options), jax.random.key(0))
+
+
+def some_rows(length: int, first: tuple[int, ...] = (0,), seed: int = 0) -> TimeStep:
+    """Random rows `[T, ...]` of three agents, resets at `first`."""
+    rng = np.random.default_rng(seed)
+    is_first = np.isin(np.arange(length), first)
+    action = np.where(is_first[:, None], 0, rng.integers(0, 3, (length, 3)))
+    return TimeStep(
+        prev_action=jnp.asarray(action, jnp.int32),
+        reward=jnp.asarray(rng.normal(size=(length, 3)), jnp.float32),
+        terminated=jnp.zeros((length, 3), bool),
+        truncated=jnp.zeros(length, bool),
+        obs=jnp.asarray(rng.normal(size=(length, 3, 4)), jnp.float32),
+        state=jnp.asarray(rng.normal(size=(length, 5)), jnp.float32),
+        available=jnp.ones((length, 3, 3), bool),
+        alive=jnp.ones((length, 3), bool),
+        is_first=jnp.asarray(is_first),
+        score=jnp.full(length, jnp.nan),
+    )
+
+
+def observed(model: MABL, rows: TimeStep, seed: int = 1):
+    """Latents, posterior and prior logits, predictions of one sequence."""
+    key_observe, key_prior = jax.random.split(jax.random.key(seed))
+    latents, posterior = observe_sequence(model, rows, key_observe)
+    prior = jax.vmap(model.prior)(latents, jax.random.split(key_prior, len(rows.is_first)))
+    return latents, posterior, prior, jax.vmap(model.predict)(latents)
+
+
+PARTS = ("kl_agent", "kl_global", "obs", "reward", "terminated", "available", "action")
+
+
+@eqx.filter_jit
+def jacobian(model: MABL, rows: TimeStep) -> dict[str, dict[str, jax.Array]]:
+    """Largest absolute gradient of each term of the loss in each part of the model."""
+
+    def terms(model: MABL) -> jax.Array:
+        _, posterior, prior, predicted = observed(model, rows)
+        kl = [
+            balanced_kl(posterior[level], prior[level], 0.8, 0.2).sum()
+            for level in ("agent", "global")
+        ]
+        return jnp.stack(kl + [(getattr(predicted, part) ** 2).sum() for part in PARTS[2:]])
+
+    gradient = eqx.filter_jacrev(terms)(model)
+    return {
+        part: {
+            name: jnp.stack(
+                [jnp.abs(x[i]).max() for x in jax.tree.leaves(getattr(gradient, name))]
+            ).max()
+            for name in (*GLOBAL, "filter", "heads")
+        }
+        for i, part in enumerate(PARTS)
+    }
+
+
+@cache
+def gradients(first: tuple[int, ...] = (0,), **options) -> dict[str, dict[str, float]]:
+    """`jacobian` over three rows with resets at `first`."""
+    return jax.device_get(jacobian(build(**options), some_rows(3, first)))
+
+
+def test_agent_kl_alone_trains_the_global_prior_and_the_global_recurrent_model():
+    norms = gradients()["kl_agent"]
+    for name in ("global_prior", "global_recurrent", "agent_prior", "filter"):
+        assert norms[name] > 0, name
+
+
+@pytest.mark.parametrize(
+    ("source", "reached", "spared"),
+    [
+        ("prior", "global_prior", "global_posterior"),
+        ("posterior", "global_posterior", "global_prior"),
+    ],
+)
+def test_agent_kl_reaches_the_global_level_through_the_sample_it_is_conditioned_on(
+    source, reached, spared
+):
+    # Every row is a first one, so that nothing can come from an earlier row's global sample.
+    norms = gradients((0, 1, 2), agent_prior_input=source)["kl_agent"]
+    assert norms[reached] > 0
+    assert norms[spared] == 0
+
+
+def test_global_kl_reaches_the_filter_bottom_up_but_not_the_agent_prior():
+    norms = gradients()["kl_global"]
+    assert norms["global_posterior"] > 0
+    assert norms["filter"] > 0
+    assert norms["agent_prior"] == 0
+
+
+def test_observation_loss_does_not_touch_the_global_level():
+    norms = gradients()["obs"]
+    assert norms["filter"] > 0
+    for name in GLOBAL:
+        assert norms[name] == 0, name
+
+
+@pytest.mark.parametrize("part", ["terminated", "available", "action"])
+def test_termination_availability_and_action_train_both_levels(part):
+    norms = gradients()[part]
+    for name in ("filter", "global_recurrent", "global_posterior", "state_encoder"):
+        assert norms[name] > 0, name
+    for name in ("global_prior", "agent_prior"):
+        assert norms[name] == 0, name
+
+
+@pytest.mark.parametrize(("reward_input", "reaches"), [("agent", False), ("both", True)])
+def test_reward_trains_the_global_level_only_if_it_sees_it(reward_input, reaches):
+    norms = gradients(reward_input=reward_input)["reward"]
+    assert norms["filter"] > 0
+    for name in ("state_encoder", "global_recurrent", "global_posterior"):
+        assert bool(norms[name] > 0) is reaches, name
+
+
+@pytest.fixture(scope="module")
+def model() -> MABL:
+    return build()
+
+
+@pytest.fixture(scope="module")
+def posterior_of(model):
+    """Latents and posterior logits of a sequence, with the same key each time."""
+    return jax.jit(lambda rows: observed(model, rows)[:2])
+
+
+@pytest.mark.parametrize("changed", ["state", "teammate's obs", "teammate's action"])
+def test_agent_level_of_the_posterior_sees_neither_state_nor_teammates(posterior_of, changed):
+    rows = some_rows(3)
+    other = {
+        "state": rows._replace(state=rows.state + 9),
+        "teammate's obs": rows._replace(obs=rows.obs.at[:, 1].add(9)),
+        "teammate's action": rows._replace(
+            prev_action=rows.prev_action.at[1:, 1].set((rows.prev_action[1:, 1] + 1) % 3)
+        ),
+    }[changed]
+    (before, logits), (after, other_logits) = posterior_of(rows), posterior_of(other)
+    for agent in (0, 2):
+        assert_array_equal(before.agent.h[:, agent], after.agent.h[:, agent])
+        assert_array_equal(before.agent.z[:, agent], after.agent.z[:, agent])
+        assert_array_equal(logits["agent"][:, agent], other_logits["agent"][:, agent])
+    # Positive controls: agent 0's global level sees what its agent level does not; of a
+    # teammate's observation only the teammate's own levels know.
+    if changed == "teammate's obs":
+        assert (logits["agent"][:, 1] != other_logits["agent"][:, 1]).any((1, 2)).all()
+        assert (logits["global"][:, 1] != other_logits["global"][:, 1]).any()
+    else:
+        since = {"state": 0, "teammate's action": 1}[changed]
+        moved = logits["global"][since:, 0] != other_logits["global"][since:, 0]
+        assert moved.any((1, 2)).all()
+
+
+def test_global_posterior_sees_the_state_the_agents_own_sample_and_h(model):
+    rows = some_rows(1)
+    _, logits, _, _ = observed(model, rows)
+    _, changed, _, _ = observed(model, rows._replace(state=rows.state + 1))
+    assert_array_equal(logits["agent"], changed["agent"])
+    assert not np.allclose(logits["global"], changed["global"])
+    # Changing what agent 1 sees moves its z^a, hence its own global posterior, not agent 0's.
+    _, changed, _, _ = observed(model, rows._replace(obs=rows.obs.at[:, 1].add(9)))
+    assert_array_equal(logits["global"][:, 0], changed["global"][:, 0])
+    assert not np.allclose(logits["global"][:, 1], changed["global"][:, 1])
+
+
+def test_agent_prior_depends_on_the_sample_of_the_global_prior(model):
+    latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
+    one, other = (model.prior(latent, jax.random.key(seed)) for seed in (0, 1))
+    assert_array_equal(one["global"], other["global"])
+    assert not np.allclose(one["agent"], other["agent"])
+    # The posterior sample is not an input of it ...
+    moved = latent._replace(global_=latent.global_._replace(z=latent.global_.z[:, ::-1]))
+    assert_array_equal(model.prior(moved, jax.random.key(0))["agent"], one["agent"])
+
+
+def test_agent_prior_input_posterior_takes_the_posterior_sample_instead():
+    model = build(agent_prior_input="posterior")
+    latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
+    one, other = (model.prior(latent, jax.random.key(seed)) for seed in (0, 1))
+    assert_array_equal(one["agent"], other["agent"])
+    moved = latent._replace(global_=latent.global_._replace(z=latent.global_.z[:, ::-1]))
+    assert not np.allclose(model.prior(moved, jax.random.key(0))["agent"], one["agent"])
+
+
+def test_priors_do_not_see_the_row_they_predict(model):
+    # The row's own z is not an input of either prior: only h, which precedes it.
+    latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
+    moved = latent._replace(agent=latent.agent._replace(z=latent.agent.z[:, ::-1]))
+    before, after = (model.prior(x, jax.random.key(0)) for x in (latent, moved))
+    assert_array_equal(before["agent"], after["agent"])
+    assert_array_equal(before["global"], after["global"])
+
+
+def test_imagination_advances_both_embeddings_as_observation_does(model):
+    rows = some_rows(2)
+    latents = observed(model, rows)[0]
+    start = jax.tree.map(lambda x: x[0], latents)
+    action = SPEC.action_space.encode(rows.prev_action[1])
+    imagined = model.imagine(start, action, jax.random.key(5))
+    assert_allclose(imagined.agent.h, latents.agent.h[1], rtol=1e-5, atol=1e-6)
+    assert_allclose(imagined.global_.h, latents.global_.h[1], rtol=1e-5, atol=1e-6)
+    for level in imagined:
+        assert_array_equal(level.z.reshape(3, 3, 4).sum(-1), 1.0)
+
+
+def test_imagined_agent_state_follows_the_imagined_global_state():
+    # Rig both priors to be certain: the global one of its first class, the agent one to copy.
+    model = build()
+    big = 50.0
+
+    def constant(net, bias):
+        last = lambda n: (n.mlp.layers[-1].weight, n.mlp.layers[-1].bias)  # noqa: E731
+        return eqx.tree_at(last, net, (jnp.zeros_like(last(net)[0]), bias))
+
+    def copier(net):  # hidden unit k repeats input 16 + k, the sample of the global prior
+        first, last = net.mlp.layers
+        return eqx.tree_at(
+            lambda n: (n.mlp.layers[0].weight, n.mlp.layers[1].weight),
+            net,
+            (
+                jnp.zeros_like(first.weight).at[16 + jnp.arange(12), jnp.arange(12)].set(1.0),
+                jnp.zeros_like(last.weight).at[jnp.arange(12), jnp.arange(12)].set(big),
+            ),
+        )
+
+    for chosen in (0, 3):
+        bias = big * jax.nn.one_hot(jnp.full(3, chosen), 4).ravel()
+        rigged = eqx.tree_at(
+            lambda m: (m.global_prior, m.agent_prior),
+            model,
+            (constant(model.global_prior, bias), copier(model.agent_prior)),
+        )
+        z = rigged.imagine(rigged.initial(), jnp.zeros((3, 3)), jax.random.key(0)).agent.z
+        assert_array_equal(z.reshape(3, 3, 4).argmax(-1), np.full((3, 3), chosen))
+
+
+def test_a_first_row_resets_both_levels(model):
+    rows = some_rows(5, first=(0, 3))
+    rows = rows._replace(prev_action=rows.prev_action.at[3].set(2))  # must not matter
+    inputs = jax.vmap(model.encode)(rows)
+    keys = jax.random.split(jax.random.key(1), 5)
+    observe = jax.jit(lambda latent, inputs, key: model.observe(latent, inputs, key))
+
+    def run(latent, at):
+        for t in at:
+            latent, _ = observe(latent, jax.tree.map(lambda x, t=t: x[t], inputs), keys[t])
+        return latent
+
+    for end in (4, 5):
+        going_on, fresh = run(model.initial(), range(end)), run(model.initial(), range(3, end))
+        jax.tree.map(assert_array_equal, going_on, fresh)
+    # Without the reset the past does matter.
+    unreset = inputs._replace(is_first=inputs.is_first.at[3].set(False))
+    latent = run(model.initial(), range(3))
+    resumed, _ = observe(latent, jax.tree.map(lambda x: x[3], unreset), keys[3])
+    assert not np.allclose(resumed.agent.h, run(model.initial(), range(4)).agent.h)
+
+
+def test_features_are_the_agent_level_for_actors_and_both_levels_for_critics(model):
+    latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
+    assert_array_equal(
+        model.actor_features(latent), np.concatenate([latent.agent.z, latent.agent.h], -1)
+    )
+    both = (latent.agent.z, latent.global_.z, latent.agent.h, latent.global_.h)
+    assert_array_equal(model.critic_features(latent), np.concatenate(both, -1))
+
+
+# --- model_loss -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def losses_of(model):
+    """The terms of the loss at batched rows."""
+
+    @jax.jit
+    def terms(rows: TimeStep):
+        return model_loss(model, rows, jax.random.key(0), CONFIG, SPEC.action_space)
+
+    return terms
+
+
+def batched(rows: TimeStep) -> TimeStep:
+    return jax.tree.map(lambda x: x[None], rows)
+
+
+def test_the_loss_is_the_sum_of_its_terms(losses_of):
+    total, metrics = losses_of(batched(some_rows(4)))
+    names = ("obs", "reward", "terminated", "available", "action", "kl_agent", "kl_global")
+    terms = [float(metrics[f"world_model/loss_{name}"]) for name in names]
+    assert {n for n in metrics if n.startswith("world_model/loss_")} == {
+        f"world_model/loss_{name}" for name in names
+    }
+    assert min(terms) > 0
+    assert_allclose(total, sum(terms), rtol=1e-6)
+    assert_allclose(metrics["world_model/loss"], total)
+
+
+def test_the_action_of_a_first_row_does_not_matter(losses_of):
+    rows = some_rows(4, first=(0, 2))
+    other = rows._replace(prev_action=rows.prev_action.at[jnp.array([0, 2])].set(2))
+    jax.tree.map(assert_array_equal, losses_of(batched(rows)), losses_of(batched(other)))
+
+
+class Rigged(eqx.Module):
+    """A model that predicts zeros, with one level of two categoricals of known logits."""
+
+    n_agents: int = eqx.field(static=True)
+
+    def initial(self):
+        return jnp.zeros(self.n_agents)
+
+    def encode(self, row):
+        return row.is_first
+
+    def observe(self, latent, inputs, key):
+        return latent, {"level": self.logits([0.5, 0.5], [0.9, 0.1])}
+
+    def prior(self, latent, key):
+        return {"level": self.logits([0.25, 0.75], [0.5, 0.5])}
+
+    def logits(self, *probs):
+        logits = jnp.log(jnp.array(probs))
+        return jnp.broadcast_to(logits, (self.n_agents, *logits.shape))
+
+    def predict(self, latent):
+        zeros = jnp.zeros(self.n_agents)
+        return Predictions(
+            obs=jnp.zeros((self.n_agents, 4)),
+            reward=zeros,
+            terminated=zeros,
+            available=jnp.zeros((self.n_agents, 3)),
+            action=jnp.zeros((self.n_agents, 3)),
+        )
+
+
+def rigged_loss(rows: TimeStep, space=SPEC.action_space, **options) -> dict[str, float]:
+    config = replace(CONFIG, **options)
+    _, metrics = model_loss(Rigged(3), rows, jax.random.key(0), config, space)  # pyright: ignore
+    return {k.removeprefix("world_model/loss_"): float(v) for k, v in metrics.items()}
+
+
+def test_each_term_by_hand():
+    # Two rows, the first a reset; three agents.
+    rows = some_rows(2)._replace(
+        obs=jnp.array([[[1.0, 0, 0, 0]] * 3, [[3.0, 1.0, 0, 0]] * 3]),
+        reward=jnp.array([[0.0, 0.0, 0.0], [2.0, 0.5, 2.0]]),
+    )
+    terms = rigged_loss(batched(rows))
+    # Huber of 1, 3: 0.5, 2.5; summed over features 0.5 and 2.5 + 0.5, mean over two rows
+    assert_allclose(terms["obs"], 1.75, rtol=1e-5)
+    # Huber of 2, 0.5, 2: 1.5, 0.125, 1.5, and three zeros
+    assert_allclose(terms["reward"], 3.125 / 6, rtol=1e-5)
+    assert_allclose(terms["terminated"], np.log(2), rtol=1e-5)
+    assert_allclose(terms["available"], 3 * np.log(2), rtol=1e-5)  # summed over three actions
+    assert_allclose(terms["action"], np.log(3) / 2, rtol=1e-5)  # not at the first row
+    # Means over two categoricals of 0.143841 and 0.368064
+    assert_allclose(terms["kl_level"], 0.255952, rtol=1e-5)
+
+
+def test_options_of_the_losses_by_hand():
+    rows = some_rows(2)._replace(reward=jnp.array([[0.0, 0.0, 0.0], [2.0, 0.5, 2.0]]))
+    terms = rigged_loss(
+        batched(rows), reward_loss="mse", kl_reduction="sum", kl_weight=0.1, free_nats=0.6
+    )
+    assert_allclose(terms["reward"], (2 + 0.125 + 2) / 6, rtol=1e-5)
+    assert_allclose(terms["kl_level"], 0.06, rtol=1e-5)  # 0.511905 is raised to 0.6, times 0.1
+
+
+def test_dead_agents_neither_teach_observations_nor_actions():
+    rows = some_rows(2)._replace(alive=jnp.array([[True, True, False], [True, False, False]]))
+    other = rows._replace(
+        obs=rows.obs.at[0, 2].set(77).at[1, 1:].set(77),
+        prev_action=rows.prev_action.at[1, 1:].set(2),
+    )
+    before, after = rigged_loss(batched(rows)), rigged_loss(batched(other))
+    assert before == after
+    assert_allclose(before["action"], np.log(3) / 6, rtol=1e-5)  # one of six entries counts
+
+
+def test_continuous_actions_are_regressed():
+    rows = some_rows(2)._replace(prev_action=jnp.full((2, 3, 3), 0.5))
+    terms = rigged_loss(batched(rows), Continuous(3))
+    assert_allclose(terms["action"], 3 * 0.125 / 2, rtol=1e-5)  # half of 0.5^2, three dimensions
+
+
+def test_huber_is_quadratic_within_one_and_linear_beyond():
+    reward, zeros = jnp.array([0.5, -1.0, 3.0]), jnp.zeros(3)
+    assert_allclose(reward_loss(zeros, reward, "huber"), [0.125, 0.5, 2.5])
+    assert_allclose(reward_loss(zeros, reward, "mse"), [0.125, 0.5, 4.5])
