@@ -198,6 +198,7 @@ class Clockwork(eqx.Module):
         return Predictions(
             obs=jnp.zeros((2, 1)),
             reward=100.0 * c + latent.action,
+            agent_reward=jnp.full(2, -1.0),
             terminated=jnp.where(c == 13, 99.0, jnp.where(c == 11, -jnp.log(3.0), -99.0)),
             available=jnp.where(jnp.arange(3)[None] != c[:, None] % 3, 99.0, -99.0),
             action=jnp.zeros((2, 3)),

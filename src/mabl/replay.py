@@ -56,7 +56,7 @@ def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int)
     lane = jnp.searchsorted(ends, pick, side="right")
     age = pick - (ends - starts)[lane]
     oldest = (replay.cursor - replay.size)[lane]
-    index = (oldest[:, None] + age[:, None] + jnp.arange(length)) % capacity
+    index = ((oldest + age)[:, None] + jnp.arange(length)[None]) % capacity
     return jax.tree.map(lambda x: x[lane[:, None], index], replay.rows)
 
 

@@ -59,7 +59,16 @@ def observed(model: MABL, rows: TimeStep, seed: int = 1):
     return latents, posterior, prior, jax.vmap(model.predict)(latents)
 
 
-PARTS = ("kl_agent", "kl_global", "obs", "reward", "terminated", "available", "action")
+PARTS = (
+    "kl_agent",
+    "kl_global",
+    "obs",
+    "reward",
+    "agent_reward",
+    "terminated",
+    "available",
+    "action",
+)
 
 
 @eqx.filter_jit
@@ -143,6 +152,13 @@ def test_reward_trains_the_global_level_only_if_it_sees_it(reward_input, reaches
     assert norms["filter"] > 0
     for name in ("state_encoder", "global_recurrent", "global_posterior"):
         assert bool(norms[name] > 0) is reaches, name
+
+
+def test_the_agents_own_reward_predictor_trains_the_agent_level_alone():
+    norms = gradients(reward_input="both")["agent_reward"]
+    assert norms["filter"] > 0
+    for name in GLOBAL:
+        assert norms[name] == 0, name
 
 
 @pytest.fixture(scope="module")
@@ -358,6 +374,7 @@ class Rigged(eqx.Module):
         return Predictions(
             obs=jnp.zeros((self.n_agents, 4)),
             reward=zeros,
+            agent_reward=zeros + 1.0,
             terminated=zeros,
             available=jnp.zeros((self.n_agents, 3)),
             action=jnp.zeros((self.n_agents, 3)),
@@ -395,6 +412,15 @@ def test_options_of_the_losses_by_hand():
     )
     assert_allclose(terms["reward"], (2 + 0.125 + 2) / 6, rtol=1e-5)
     assert_allclose(terms["kl_level"], 0.06, rtol=1e-5)  # 0.511905 is raised to 0.6, times 0.1
+
+
+def test_the_agents_own_reward_predictor_is_trained_beside_one_that_sees_both_levels():
+    rows = batched(some_rows(2)._replace(reward=jnp.array([[0.0, 0.0, 0.0], [2.0, 0.5, 2.0]])))
+    assert "agent_reward" not in rigged_loss(rows, reward_input="agent")
+    terms = rigged_loss(rows, reward_input="both")
+    # It predicts 1: Huber of errors 1, 1, 1, 1, 0.5, 1
+    assert_allclose(terms["agent_reward"], (5 * 0.5 + 0.125) / 6, rtol=1e-5)
+    assert_allclose(terms["reward"], 3.125 / 6, rtol=1e-5)
 
 
 def test_dead_agents_neither_teach_observations_nor_actions():

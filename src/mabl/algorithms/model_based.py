@@ -72,7 +72,7 @@ class ModelBased(NamedTuple):
             learner.model, rows, key_loss, config, self.spec.action_space
         )
         step, model_opt = self._optimiser().update(gradient, learner.model_opt)
-        metrics["world_model/gradient_norm"] = optax.global_norm(gradient)
+        metrics["world_model/gradient_norm"] = optax.tree.norm(gradient)
         model = eqx.apply_updates(learner.model, step)
         return learner._replace(model=model, model_opt=model_opt), metrics
 

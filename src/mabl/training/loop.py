@@ -103,7 +103,7 @@ class Training(NamedTuple):
 
 def steps_in(collected: Rollout) -> Int[Array, ""]:
     """Joint environment steps of a rollout: its valid rows less its resets."""
-    valid = jnp.arange(collected.rows.is_first.shape[-1]) < collected.count[..., None]
+    valid = jnp.arange(collected.rows.is_first.shape[1])[None] < collected.count[:, None]
     return (valid & ~collected.rows.is_first).sum(dtype=jnp.int32)
 
 

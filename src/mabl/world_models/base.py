@@ -39,6 +39,8 @@ class WorldModelConfig:
     then the agent's own predictor is trained beside it."""
     reward_loss: Literal["huber", "mse"] = "huber"
     """Likelihood of the reward: smooth L1 with delta 1, or half the squared error."""
+    reward_weight: float = 1.0
+    """Weight of the reward's loss: what pays is a small part of what is seen."""
     kl_reduction: Literal["mean", "sum"] = "mean"
     """How the KL of a level is reduced over its categoricals."""
     kl_weight: float = 1.0
@@ -62,7 +64,7 @@ class WorldModelConfig:
         require_positive(self, "hidden", "n_hidden", "n_categoricals", "n_classes", "batch_size")
         require_positive(self, "batch_length", "learning_rate", "grad_clip")
         require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
-        require_between(self, 0, inf, "free_nats")
+        require_between(self, 0, inf, "free_nats", "reward_weight")
 
 
 class WorldModel(Protocol[L]):
@@ -146,7 +148,8 @@ def model_loss(
     acted = alive * ~rows.is_first[..., None]
     losses = {
         "obs": (alive * optax.huber_loss(predicted.obs, rows.obs).sum(-1)).mean(),
-        "reward": reward_loss(predicted.reward, rows.reward, config.reward_loss).mean(),
+        "reward": config.reward_weight
+        * reward_loss(predicted.reward, rows.reward, config.reward_loss).mean(),
         "terminated": optax.sigmoid_binary_cross_entropy(
             predicted.terminated, rows.terminated.astype(jnp.float32)
         ).mean(),
@@ -158,9 +161,10 @@ def model_loss(
         "action": (acted * action_loss(predicted.action, rows.prev_action, action_space)).mean(),
     }
     if config.reward_input == "both":
-        losses["agent_reward"] = reward_loss(
-            predicted.agent_reward, rows.reward, config.reward_loss
-        ).mean()
+        losses["agent_reward"] = (
+            config.reward_weight
+            * reward_loss(predicted.agent_reward, rows.reward, config.reward_loss).mean()
+        )
     for level in posterior:
         losses[f"kl_{level}"] = (
             config.kl_weight
