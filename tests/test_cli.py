@@ -1,10 +1,16 @@
 """The command line, as a person meets it: one line for a mistake, and runs that go on."""
 
 import json
+import os
+import shutil
+import signal
+import threading
+import time
 
+import numpy as np
 import pytest
 
-from mabl import cli
+from mabl import Policy, UserError, cli
 
 TINY = [
     "--env=test/coordination",
@@ -120,8 +126,6 @@ def test_a_run_folder_holds_what_the_documentation_says(trained):
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(trained, mabl, tmp_path):
-    import shutil
-
     resumed = tmp_path / "run"
     shutil.copytree(trained, resumed)
     with (resumed / "metrics.jsonl").open("a") as file:
@@ -130,6 +134,57 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(trained, mabl, tm
     assert mabl("train", *TINY, "--total-steps=1200", f"--logdir={tmp_path / 'whole'}")[0] == 0
     (whole,) = (tmp_path / "whole").glob("test/coordination/mabl/seed_0/*")
     assert rows_of(resumed) == rows_of(whole)
+
+
+def test_ctrl_c_saves_and_the_run_can_be_resumed(mabl, tmp_path):
+    logdir = tmp_path / "runs"
+
+    def interrupt():
+        while not any(logdir.glob("test/coordination/mabl/seed_0/*/metrics.jsonl")):
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    code, _, err = mabl("train", *TINY, "--total-steps=10000000", f"--logdir={logdir}")
+    thread.join()
+    assert code == cli.INTERRUPTED and "interrupted at" in err and "mabl resume" in err
+    (folder,) = logdir.glob("test/coordination/mabl/seed_0/*")
+    (done,) = (int(path.name) for path in (folder / "checkpoints").iterdir())
+    assert rows_of(folder)[-1]["step"] == done
+    assert mabl("resume", folder, f"--total-steps={done + 100}")[0] == 0
+    assert rows_of(folder)[-1]["step"] >= done + 100
+
+
+def test_seeds_of_one_program_have_their_own_folders(mabl, tmp_path):
+    code, _, _ = mabl("train", *TINY, "--num-seeds=2", "--total-steps=600", f"--logdir={tmp_path}")
+    assert code == 0
+    folders = sorted(tmp_path.glob("test/coordination/mabl/seed_*/*"))
+    assert [folder.parent.name for folder in folders] == ["seed_0", "seed_1"]
+    first, second = map(rows_of, folders)
+    assert first[-1]["world_model/loss"] != second[-1]["world_model/loss"]
+    assert mabl("resume", folders[1], "--total-steps=700")[0] == 0
+
+
+def test_one_agent_acts_with_its_own_policy(trained):
+    policy = Policy.load(trained, greedy=False, seed=3)
+    obs, available = np.zeros(6, np.float32), np.array([False, True, False, True])
+    first = [policy.act(obs, available) for _ in range(20)]
+    assert set(first) <= {1, 3} and all(isinstance(action, int) for action in first)
+    again = Policy.load(trained, greedy=False, seed=3)
+    assert [again.act(obs, available) for _ in range(20)] == first
+    with pytest.raises(UserError, match=r"obs has shape \(5,\), the policy expects \(6,\)"):
+        policy.act(np.zeros(5))
+    with pytest.raises(UserError, match=r"available has shape \(3,\), the policy expects \(4,\)"):
+        policy.act(obs, np.ones(3, bool))
+
+
+def test_a_greedy_policy_starts_anew_after_reset(trained):
+    policy = Policy.load(trained)
+    before = policy._level
+    policy.act(np.ones(6))
+    policy.reset()
+    assert all((a == b).all() for a, b in zip(before, policy._level, strict=True))
 
 
 def test_resuming_a_finished_run_says_so(trained, mabl):
@@ -156,8 +211,6 @@ def test_eval_in_another_environment_says_what_does_not_fit(trained, mabl):
 
 
 def test_a_damaged_config_is_named(trained, mabl, tmp_path):
-    import shutil
-
     copy = tmp_path / "run"
     shutil.copytree(trained, copy)
     text = (copy / "config.yaml").read_text()

@@ -28,8 +28,8 @@ def imagine_trajectory(
     """Roll the policy through the model from one posterior latent; no batch axis.
 
     Row 0 is the start, with its real availability; each of the `horizon - 1` further rows is a
-    prior sample, its availability drawn from the model (or its mode). `weight` says how much the start counts. No
-    gradient flows: PPO's epochs run on these rows as data.
+    prior sample, its availability drawn from the model (or its mode). `weight` says how much the
+    start counts. No gradient flows: PPO's epochs run on these rows as data.
     """
 
     def step(carry: tuple[L, Array], key: PRNGKey) -> tuple[tuple[L, Array], tuple]:

@@ -75,18 +75,13 @@ class Config:
     def __post_init__(self) -> None:
         require_positive(self, "total_steps", "num_seeds")
         require_between(self, 0, 2**32 - 1, "seed")
-        most_rows = self.training.replay_capacity // self.training.num_envs
-        if (self.training.collect_steps or 0) > most_rows:
-            raise UserError(
-                f"--training.collect-steps {self.training.collect_steps} is more than the replay "
-                f"holds of an environment, {most_rows}: give fewer or a larger replay"
-            )
-        shortest = self.training.replay_capacity // self.training.num_envs
-        if shortest < self.world_model.batch_length:
+        rows = self.training.replay_capacity // self.training.num_envs
+        needed = max(self.world_model.batch_length, self.training.collect_steps or 0)
+        if rows < needed:
             raise UserError(
                 f"--training.replay-capacity {self.training.replay_capacity} leaves each of "
-                f"{self.training.num_envs} environments {shortest} rows: give at least "
-                f"{self.world_model.batch_length * self.training.num_envs}"
+                f"{self.training.num_envs} environments {rows} rows: give at least "
+                f"{needed * self.training.num_envs}"
             )
 
 

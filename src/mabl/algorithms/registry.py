@@ -29,10 +29,18 @@ ALGORITHMS = {
 def make(config: Config, spec: EnvSpec) -> ModelBased:
     """The algorithm of `config` for an environment.
 
-    Raises UserError for an unknown name, or for an action space that it cannot act in.
+    Raises UserError for an unknown name, for actions that it cannot take, and for a replay
+    too small for one episode.
     """
     if config.algo not in ALGORITHMS:
         raise unknown_name("algorithm", config.algo, ALGORITHMS)
     if not isinstance(spec.action_space, Discrete):
         raise UserError(f"{spec.name} has continuous actions, {config.algo} needs discrete ones")
+    plan = config.training
+    needed = (spec.episode_limit + 1) * plan.num_envs
+    if plan.collect_steps is None and plan.replay_capacity < needed:
+        raise UserError(
+            f"--training.replay-capacity {plan.replay_capacity} cannot hold an episode of "
+            f"{spec.name} from each environment: give at least {needed}"
+        )
     return ALGORITHMS[config.algo].build(spec, config)

@@ -54,7 +54,9 @@ class Progress:
         elif now - self._last_line > LINE_EVERY or row["step"] >= self._total:
             self._last_line = now
             fields = "  ".join(f"{name} {value}" for name, value in self._fields(row, now))
-            self._console.print(f"{row['step']:>9,.0f} steps  {fields}", highlight=False)
+            self._console.print(
+                f"{row['step']:>9,.0f} steps  {fields}", highlight=False, soft_wrap=True
+            )
 
     def _episodes(self) -> float:
         return sum(row.get("train/episodes", 0) for row in self._recent)
@@ -80,7 +82,7 @@ class Progress:
             ("critic loss", "behaviour/critic_loss"),
             ("entropy", "behaviour/entropy"),
         ):
-            if name in row:
+            if math.isfinite(row.get(name, math.nan)):
                 fields.append((label, f"{row[name]:.3g}"))
         fields.append(("steps/s", f"{speed:.0f}"))
         fields.append(("left", duration(left)))
