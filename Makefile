@@ -1,4 +1,4 @@
-.PHONY: check lint types layers test
+.PHONY: check lint types layers test pins
 
 check: lint types layers test
 
@@ -14,3 +14,7 @@ layers:
 
 test:
 	uv run pytest
+
+# The versions to paste into [tool.uv] constraint-dependencies, after removing the old ones there.
+pins:
+	uv export -q --upgrade --no-hashes --no-emit-project --no-header --no-annotate
