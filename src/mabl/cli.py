@@ -144,7 +144,9 @@ def list_envs(arguments: list[str]) -> None:
     from mabl.envs import registry
 
     rows = registry.names()
-    table = Table(*[name.replace("_", " ") for name in rows[0]._fields], box=None)
+    table = Table(box=None)
+    for name in rows[0]._fields:
+        table.add_column(name.replace("_", " "), no_wrap=name == "name")
     for row in rows:
         table.add_row(*map(str, row))
     Console().print(table)

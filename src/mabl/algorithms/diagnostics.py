@@ -70,7 +70,7 @@ def open_loop(
 
         return jax.lax.scan(step, latent, (actions, jax.random.split(key, steps)))[1]
 
-    windows = jnp.arange(n_starts)[:, None] + jnp.arange(1, steps + 1)
+    windows = jnp.arange(n_starts)[:, None] + jnp.arange(1, steps + 1)[None]
     return jax.vmap(jax.vmap(one, out_axes=1), out_axes=1)(
         jax.tree.map(lambda x: x[:, :n_starts], latents),
         actions[:, windows],
@@ -95,8 +95,8 @@ def unexplained(
     """Share of the target's variance that the prediction leaves: 1 - R^2."""
     weight = mask.reshape(*mask.shape, *[1] * (real.ndim - 2)).astype(jnp.float32)
     weight = jnp.broadcast_to(weight, real.shape)
-    total = weight.sum((0, 1)) + 1e-8
-    mean = (weight * real).sum((0, 1)) / total
+    total = weight.sum((0, 1), keepdims=True) + 1e-8
+    mean = (weight * real).sum((0, 1), keepdims=True) / total
     return (weight * (predicted - real) ** 2).sum() / ((weight * (real - mean) ** 2).sum() + 1e-8)
 
 

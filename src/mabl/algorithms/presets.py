@@ -26,14 +26,14 @@ PAPER_MODEL_LEARNING_RATE = {"smax/3s_vs_5z": 5e-4}
 QUICK = {
     "smax": Config(
         preset="quick",
-        total_steps=100_000,
+        total_steps=80_000,
         training=TrainingConfig(
             num_envs=16,
             collect_steps=16,
-            model_updates=6,
+            model_updates=18,
             policy_updates=1,
-            prefill_steps=5_000,
-            pretrain_updates=150,
+            prefill_steps=2_000,
+            pretrain_updates=500,
             replay_capacity=100_000,
             reward_scale=SMAX_REWARD_SCALE,
         ),
@@ -44,16 +44,18 @@ QUICK = {
             reward_input="both",
             reward_loss="mse",
             kl_reduction="sum",
+            kl_weight=0.1,
             learning_rate=1e-3,
             batch_size=16,
         ),
         mappo=MAPPOConfig(
             hidden=128,
             actor_out_scale=0.01,
-            actor_learning_rate=1e-3,
+            actor_learning_rate=5e-4,
             critic_learning_rate=1e-3,
             ent_coef=0.02,
             n_starts=128,
+            sample_availability=False,
         ),
     ),
     "test": Config(

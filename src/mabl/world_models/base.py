@@ -41,6 +41,8 @@ class WorldModelConfig:
     """Likelihood of the reward: smooth L1 with delta 1, or half the squared error."""
     reward_weight: float = 1.0
     """Weight of the reward's loss: what pays is a small part of what is seen."""
+    agent_reward_weight: float = 1.0
+    """Weight of the agent's own reward predictor, relative, where `reward_input` is both levels."""
     kl_reduction: Literal["mean", "sum"] = "mean"
     """How the KL of a level is reduced over its categoricals."""
     kl_weight: float = 1.0
@@ -64,7 +66,7 @@ class WorldModelConfig:
         require_positive(self, "hidden", "n_hidden", "n_categoricals", "n_classes", "batch_size")
         require_positive(self, "batch_length", "learning_rate", "grad_clip")
         require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
-        require_between(self, 0, inf, "free_nats", "reward_weight")
+        require_between(self, 0, inf, "free_nats", "reward_weight", "agent_reward_weight")
 
 
 class WorldModel(Protocol[L]):
@@ -162,7 +164,8 @@ def model_loss(
     }
     if config.reward_input == "both":
         losses["agent_reward"] = (
-            config.reward_weight
+            config.agent_reward_weight
+            * config.reward_weight
             * reward_loss(predicted.agent_reward, rows.reward, config.reward_loss).mean()
         )
     for level in posterior:

@@ -1,0 +1,42 @@
+"""Diagnostics by hand: shares of variance, within episodes only."""
+
+import jax.numpy as jnp
+import pytest
+
+from mabl.algorithms.diagnostics import masked_mean, open_loop_error, unexplained
+from mabl.envs.counting import CountingEnv
+
+
+def test_unexplained_is_squared_error_over_variance_where_the_mask_holds():
+    real = jnp.array([[[0.0], [2.0], [4.0], [99.0]]])
+    predicted = jnp.array([[[1.0], [2.0], [3.0], [0.0]]])
+    mask = jnp.array([[True, True, True, False]])
+    assert unexplained(predicted, real, mask) == pytest.approx(2 / 8)  # (1 + 0 + 1) / (4 + 0 + 4)
+    assert unexplained(jnp.full_like(real, 2.0), real, mask) == pytest.approx(1.0)
+    assert unexplained(real, real, mask) == 0.0
+
+
+def test_open_loop_error_compares_row_t_plus_k_and_skips_episode_boundaries():
+    import jax
+
+    _, row = CountingEnv().reset(jax.random.key(0))
+    length, steps = 6, 2
+    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, length, *x.shape)), row)
+    rows = rows._replace(is_first=jnp.array([[True, False, False, False, True, False]]))
+    real = jnp.arange(6.0)[None, :, None, None]  # [B, T, N, F]
+    starts = jnp.arange(4.0)[None, :, None, None]
+    exact = jnp.stack([starts + 1, starts + 2])  # [K, B, W, N, F]
+    assert open_loop_error(exact, real, rows, 1) == 0.0
+    assert open_loop_error(exact, real, rows, 2) == 0.0
+    # Two steps ahead, rows 2 and 3 lead into the next episode: being wrong there is no error.
+    wrong = exact.at[1, 0, 2:].add(100.0)
+    assert open_loop_error(wrong, real, rows, steps) == 0.0
+    # Rows 0 and 1 lead to 2 and 3, variance 0.5 in all; one of them off by 1.
+    off = exact.at[1, 0, 0].add(1.0)
+    assert open_loop_error(off, real, rows, steps) == pytest.approx(1 / 0.5)
+
+
+def test_masked_mean():
+    mean = masked_mean(jnp.array([1.0, 5.0, 9.0]), jnp.array([True, False, True]))
+    assert mean == pytest.approx(5.0)
+    assert jnp.isnan(masked_mean(jnp.ones(2), jnp.zeros(2, bool)))
