@@ -14,6 +14,9 @@ from rich.table import Table
 
 from mabl.errors import UserError, unknown_name
 
+PIPED_WIDTH = 160
+"""Columns of a table that goes to a file or another program."""
+
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""
 
@@ -134,7 +137,7 @@ def evaluate(arguments: list[str]) -> int:
         table = Table(show_header=False, box=None)
         for key, value in numbers.items():
             table.add_row(key, f"{value:.3f}" if isinstance(value, float) else str(value))
-        Console().print(table, soft_wrap=True)
+        print_table(table)
     return 0
 
 
@@ -144,12 +147,12 @@ def list_envs(arguments: list[str]) -> None:
     from mabl.envs import registry
 
     rows = registry.names()
-    table = Table(box=None)
+    table = Table(box=None, padding=(0, 1))
     for name in rows[0]._fields:
         table.add_column(name.replace("_", " "), no_wrap=name == "name")
     for row in rows:
         table.add_row(*map(str, row))
-    Console().print(table)
+    print_table(table)
 
 
 def list_algos(arguments: list[str]) -> None:
@@ -160,7 +163,12 @@ def list_algos(arguments: list[str]) -> None:
     table = Table("name", "description", box=None)
     for name, entry in ALGORITHMS.items():
         table.add_row(name, entry.description)
-    Console().print(table)
+    print_table(table)
+
+
+def print_table(table: Table) -> None:
+    """As wide as the terminal, or wide enough for a file."""
+    Console(width=None if sys.stdout.isatty() else PIPED_WIDTH).print(table)
 
 
 def print_help() -> None:
