@@ -28,6 +28,11 @@ def main() -> None:
     except UserError as error:
         print(f"mabl: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    except PermissionError as error:
+        print(f"mabl: no permission for {error.filename}: change it or copy it", file=sys.stderr)
+        sys.exit(2)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -109,6 +114,8 @@ def evaluate(arguments: list[str]) -> int:
         raise UserError("give either a run folder or --policy random|heuristic with --env")
     if given.episodes < 1:
         raise UserError(f"--episodes is {given.episodes}: give a number above 0")
+    if not 0 <= given.seed < 2**32:
+        raise UserError(f"--seed is {given.seed}: give a number from 0 to {2**32 - 1}")
     import jax
 
     from mabl.evaluation import baseline, summary

@@ -56,7 +56,7 @@ def act_alone(
     level = policy.filter(level, encoded, obs, key_latent)
     choice = policy.actor(jnp.concatenate([level.z, level.h]), available)
     action = choice.mode() if greedy else choice.sample(key_action)
-    return level, action.astype(jnp.int32)
+    return level, action.astype(action_space.dtype)
 
 
 class LocalExecutor(NamedTuple):

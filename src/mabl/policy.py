@@ -64,7 +64,7 @@ def check_fits(trained: EnvSpec, played: EnvSpec) -> None:
 class Policy:
     """One agent's policy. It sees its own observation and holds its own latent state, nothing else.
 
-    policy = Policy.load("runs/smax/3m/mabl/seed_0/20260101-120000")
+    policy = Policy.load("runs/smax/3m/mabl/seed_0/20260101-120000", seed=i)  # for agent i
     policy.reset()                        # at the start of an episode
     action = policy.act(obs, available)   # once a step
     """
@@ -77,7 +77,7 @@ class Policy:
 
     @classmethod
     def load(cls, run: Path | str, greedy: bool = True, seed: int = 0) -> "Policy":
-        """The newest policy of a run folder; load one for each agent.
+        """The newest policy of a run folder; load one for each agent, with a seed of its own.
 
         `seed` decides the samples of the latent state, and of the actions unless `greedy`.
         Raises UserError if the folder is not a run.

@@ -74,7 +74,7 @@ class Config:
 
     def __post_init__(self) -> None:
         require_positive(self, "total_steps", "num_seeds")
-        require_between(self, 0, 2**32 - 1, "seed")
+        require_between(self, 0, 2**32 - self.num_seeds, "seed")
         rows = self.training.replay_capacity // self.training.num_envs
         needed = max(self.world_model.batch_length, self.training.collect_steps or 0)
         if rows < needed:

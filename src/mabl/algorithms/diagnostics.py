@@ -15,6 +15,8 @@ from mabl.world_models.heads import Predictions
 L = TypeVar("L")
 
 OPEN_LOOP_STEPS = (1, 5, 15)
+DIAGNOSED_ROWS = max(OPEN_LOOP_STEPS) + 5
+"""Rows of the sequences that diagnostics look at."""
 
 
 def diagnose(

@@ -10,7 +10,7 @@ from einops import rearrange
 from jaxtyping import Array, Float
 
 from mabl.algorithms.config import Config
-from mabl.algorithms.diagnostics import OPEN_LOOP_STEPS, diagnose, masked_mean
+from mabl.algorithms.diagnostics import DIAGNOSED_ROWS, diagnose, masked_mean
 from mabl.behaviour import mappo
 from mabl.behaviour.mappo import MAPPO
 from mabl.envs.base import EnvSpec
@@ -110,8 +110,7 @@ class ModelBased(NamedTuple):
         `behaviour/value_at_reset` is in the environment's units: it compares with episode returns.
         """
         key_sample, key_observe, key_diagnose = jax.random.split(key, 3)
-        length = max(OPEN_LOOP_STEPS) + 5
-        rows = sample_sequences(replay, key_sample, N_DIAGNOSED, length)
+        rows = sample_sequences(replay, key_sample, N_DIAGNOSED, DIAGNOSED_ROWS)
         latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
             learner.model, rows, jax.random.split(key_observe, N_DIAGNOSED)
         )

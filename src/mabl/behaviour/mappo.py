@@ -177,19 +177,23 @@ def experience(
 def actor_loss(
     actor: Actor, rows: PPORows, ent_coef: Float[Array, ""], clip: float
 ) -> tuple[Float[Array, ""], Metrics]:
-    """PPO's clipped surrogate minus the entropy bonus."""
+    """PPO's clipped surrogate minus the entropy bonus.
+
+    Rows without a choice, such as those of the dead, do not count.
+    """
+    weight = rows.weight * (rows.available.sum(-1) != 1)
     policy = jax.vmap(jax.vmap(actor))(rows.actor_features, rows.available)
     log_prob = policy.log_prob(rows.action)
     surrogate = clipped_surrogate(log_prob, rows.log_prob, rows.advantage, clip)
-    total = rows.weight.sum() + 1e-8
-    entropy = (rows.weight * policy.entropy()).sum() / total
-    loss = (rows.weight * surrogate).sum() / total - ent_coef * entropy
+    total = weight.sum() + 1e-8
+    entropy = (weight * policy.entropy()).sum() / total
+    loss = (weight * surrogate).sum() / total - ent_coef * entropy
     ratio = jnp.exp(log_prob - rows.log_prob)
     return loss, {
         "behaviour/actor_loss": loss,
         "behaviour/entropy": entropy,
-        "behaviour/clip_fraction": (rows.weight * (jnp.abs(ratio - 1) > clip)).sum() / total,
-        "behaviour/approx_kl": (rows.weight * (rows.log_prob - log_prob)).sum() / total,
+        "behaviour/clip_fraction": (weight * (jnp.abs(ratio - 1) > clip)).sum() / total,
+        "behaviour/approx_kl": (weight * (rows.log_prob - log_prob)).sum() / total,
     }
 
 

@@ -1,5 +1,6 @@
 """`curves.png`: the run at a glance."""
 
+from collections import deque
 from pathlib import Path
 
 import matplotlib
@@ -8,6 +9,9 @@ from matplotlib.figure import Figure
 from mabl.runs.metrics import Row, column
 
 matplotlib.use("agg")
+
+EPISODES = 100
+"""Episodes that a point of the training curves averages over."""
 
 PANELS = {
     "score of training episodes": ("train/win_rate", "train/score"),
@@ -36,7 +40,9 @@ def draw(rows: list[Row], title: str, path: Path) -> None:
     axes = figure.subplots(2, 3).ravel()
     for axis, (panel, names) in zip(axes, PANELS.items(), strict=True):
         for name in names:
-            steps, values = column(rows, name)
+            steps, values = (
+                smoothed(rows, name) if name.startswith("train/") else column(rows, name)
+            )
             if steps:
                 axis.plot(steps, values, label=name.split("/")[1], linewidth=1.5)
         axis.set_title(panel, fontsize=10)
@@ -47,3 +53,23 @@ def draw(rows: list[Row], title: str, path: Path) -> None:
     temporary = path.with_name(f".{path.name}")
     figure.savefig(temporary, dpi=100, format="png")
     temporary.replace(path)
+
+
+def smoothed(rows: list[Row], name: str) -> tuple[list[float], list[float]]:
+    """A metric of training episodes as its mean over the newest `EPISODES` and more."""
+    steps, values = [], []
+    window: deque[Row] = deque()
+    episodes = total = 0.0
+    for row in rows:
+        if name not in row:
+            continue
+        window.append(row)
+        episodes += row["train/episodes"]
+        total += row[name] * row["train/episodes"]
+        while episodes - window[0]["train/episodes"] >= EPISODES:
+            oldest = window.popleft()
+            episodes -= oldest["train/episodes"]
+            total -= oldest[name] * oldest["train/episodes"]
+        steps.append(row["step"])
+        values.append(total / episodes)
+    return steps, values

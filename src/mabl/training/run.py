@@ -2,6 +2,7 @@
 
 import signal
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -10,10 +11,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from rich.console import Console
 
 from mabl.algorithms import registry as algorithms
 from mabl.algorithms.config import Config
+from mabl.algorithms.diagnostics import DIAGNOSED_ROWS
 from mabl.envs import registry as envs
 from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
@@ -26,6 +29,8 @@ from mabl.training.loop import Training, TrainState
 from mabl.training.memory import free_memory, tree_bytes
 from mabl.training.progress import Progress, duration
 
+DIAGNOSE = 2**31 - 1
+"""Sets the diagnostics' random key apart from those that training splits off."""
 CURVES_EVERY = 30.0
 """Seconds between refreshes of curves.png."""
 
@@ -59,9 +64,12 @@ def train(config: Config, console: Console | None = None) -> Outcome:
     return _run(training, state, folders, config.total_steps, console)
 
 
-def resume(path: Path, total_steps: int | None = None, console: Console | None = None) -> Outcome:
+def resume(
+    path: Path | str, total_steps: int | None = None, console: Console | None = None
+) -> Outcome:
     """Continue one run from its newest checkpoint, to `total_steps` or as configured."""
     console = console or Console(stderr=True)
+    path = Path(path)
     config = folder.read_config(path)
     if total_steps is not None:
         config = replace(config, total_steps=total_steps)
@@ -108,14 +116,14 @@ def _run(
     program = _over_seeds(training.cycle, len(folders), donate=True)
     diagnose = _over_seeds(
         lambda state: training.algorithm.diagnose(
-            state.learner, state.replay, jax.random.fold_in(state.key, 0)
+            state.learner, state.replay, jax.random.fold_in(state.key, DIAGNOSE)
         ),
         len(folders),
     )
     saved, drawn, began = step, time.monotonic(), time.monotonic()
     console.print("compiling (cached for the next run) ...", highlight=False)
     with (
-        _Interruption() as interruption,
+        _Interruption(console) as interruption,
         Progress(console, total_steps, training.env.spec.score_name, step) as progress,
     ):
         while step < total_steps and not interruption.requested:
@@ -123,9 +131,12 @@ def _run(
             n_model, n_policy = updates_due(states, config)
             states, metrics = program(states, n_model, n_policy)
             step = int(states.env_steps.min())
-            if n_model and crossed(before, step, config.training.diagnose_every):
+            if longest_lane(states) >= DIAGNOSED_ROWS and crossed(
+                before, step, config.training.diagnose_every
+            ):
                 metrics |= diagnose(states)
             metrics = jax.device_get(metrics)
+            check_finite(metrics, n_model, n_policy, step, checkpoints[0])
             seconds = time.monotonic() - cycle_began
             for k, log in enumerate(logs):
                 row = describe(
@@ -142,7 +153,7 @@ def _run(
             if time.monotonic() - drawn > CURVES_EVERY:
                 drawn = time.monotonic()
                 draw_curves(folders, config)
-    save(training, states, checkpoints)
+        save(training, states, checkpoints)
     draw_curves(folders, config)
     for log in logs:
         log.close()
@@ -159,14 +170,30 @@ def _run(
 def updates_due(states: TrainState, config: Config) -> tuple[int, int]:
     """Model and policy updates of the next cycle: none in prefill, pretraining, then M and R."""
     plan = config.training
-    rows_needed = max(plan.prefill_steps, config.world_model.batch_length)
-    if int(states.env_steps.min()) < rows_needed or int(states.replay.size.max()) < (
-        config.world_model.batch_length
-    ):
+    prefilled = int(states.env_steps.min()) >= plan.prefill_steps
+    if not prefilled or longest_lane(states) < config.world_model.batch_length:
         return 0, 0
     if int(states.model_updates[0]) < plan.pretrain_updates:
         return plan.pretrain_updates, 0
     return plan.model_updates, plan.policy_updates
+
+
+def longest_lane(states: TrainState) -> int:
+    """Rows in the longest lane of the replay of the seed that has the shortest such."""
+    return int(states.replay.size.max(-1).min())
+
+
+def check_finite(
+    metrics: Mapping[str, np.ndarray], n_model: int, n_policy: int, step: int, last: Checkpoints
+) -> None:
+    """Stop a run that diverged before it overwrites its good checkpoints."""
+    for updates, name in ((n_model, "world_model/loss"), (n_policy, "behaviour/actor_loss")):
+        if updates and not np.isfinite(metrics[name]).all():
+            kept = f"its checkpoint at {last.latest} steps is good" if last.any else "none was kept"
+            raise UserError(
+                f"training diverged before step {step} ({name} is not finite); {kept}: "
+                "lower the learning rates"
+            )
 
 
 def crossed(before: int, now: int, every: int) -> bool:
@@ -221,6 +248,9 @@ class _Interruption:
 
     requested = False
 
+    def __init__(self, console: Console):
+        self._console = console
+
     def __enter__(self) -> "_Interruption":
         try:
             self._previous = signal.signal(signal.SIGINT, self._handle)
@@ -231,6 +261,7 @@ class _Interruption:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del number, frame
         self.requested = True
+        self._console.print("stopping after this cycle; Ctrl-C again stops at once")
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def __exit__(self, *_: object) -> None:

@@ -27,7 +27,7 @@ class Predictions(NamedTuple):
 
 
 class Heads(eqx.Module):
-    """The decoders of one agent: two hidden layers each (Table 2).
+    """The decoders of one agent, of `n_hidden` hidden layers each (Table 2: two).
 
     With `both_levels_reward` a second reward predictor sees both levels; ADR 4 says why.
     """
