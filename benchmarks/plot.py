@@ -40,7 +40,8 @@ def win_rate(curve: tuple[np.ndarray, np.ndarray, np.ndarray], grid: np.ndarray)
     for end in grid:
         inside = (steps > end - WINDOW) & (steps <= end)
         total = episodes[inside].sum()
-        rates.append(wins[inside].sum() / total if total else np.nan)
+        seen = total and end < steps[-1] + 1_000
+        rates.append(wins[inside].sum() / total if seen else np.nan)
     return np.array(rates)
 
 

@@ -1,0 +1,106 @@
+"""A run's folder: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP with config, versions, metrics, checkpoints.
+
+    config.yaml      every field of the configuration
+    versions.yaml    package versions, git commit, machine
+    metrics.jsonl    one JSON object a line, `step` in environment steps
+    curves.png       refreshed during training
+    tensorboard/     the same metrics
+    checkpoints/     the newest last
+"""
+
+import dataclasses
+import importlib.metadata
+import platform
+import subprocess
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import yaml
+
+from mabl.algorithms.config import Config, from_dict
+from mabl.errors import UserError
+
+RECORDED_PACKAGES = ("mabl", "jax", "jaxlib", "equinox", "optax", "orbax-checkpoint", "jaxmarl")
+
+
+def create(config: Config, seed: int) -> Path:
+    """Make the folder of one seed's run and write its config and versions.
+
+    Raises UserError where it cannot be written.
+    """
+    config = replace(config, seed=seed, num_seeds=1)
+    parent = Path(config.logdir) / config.env / config.algo / f"seed_{seed}"
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        folder = unused(parent, stamp)
+        folder.mkdir()
+        write_config(folder, config)
+        write_yaml(folder / "versions.yaml", versions())
+    except OSError as error:
+        raise UserError(
+            f"cannot write to {parent} ({error.strerror}): choose another --logdir"
+        ) from error
+    return folder
+
+
+def unused(parent: Path, stamp: str) -> Path:
+    """`parent/stamp`, with a suffix if two runs start within a second."""
+    folder, n = parent / stamp, 1
+    while folder.exists():
+        n += 1
+        folder = parent / f"{stamp}-{n}"
+    return folder
+
+
+def read_config(folder: Path) -> Config:
+    """The configuration of a run. Raises UserError if the folder is not a run."""
+    path = folder / "config.yaml"
+    if not path.is_file():
+        raise UserError(f"{folder} is not a run folder (no config.yaml): give one made by mabl train")
+    try:
+        data = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is not readable YAML: restore it or train again") from error
+    try:
+        return from_dict(Config, data)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+def write_config(folder: Path, config: Config) -> None:
+    """Record a changed configuration, e.g. more steps after a resume."""
+    write_yaml(folder / "config.yaml", dataclasses.asdict(config))
+
+
+def write_yaml(path: Path, data: dict) -> None:
+    """Plain YAML in the given order; the file is replaced whole."""
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(yaml.safe_dump(data, sort_keys=False))
+    temporary.replace(path)
+
+
+def versions() -> dict[str, str]:
+    """What the numbers of this run depend on besides its config."""
+    found = {name: importlib.metadata.version(name) for name in RECORDED_PACKAGES}
+    return {
+        **found,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "git": git_commit(),
+    }
+
+
+def git_commit() -> str:
+    """The commit of mabl's source tree, or `unknown` outside a checkout."""
+    try:
+        return subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
