@@ -1,4 +1,4 @@
-"""Checkpoints: everything that decides a run's future, written atomically with Orbax, the last K kept.
+"""Checkpoints: all that decides a run's future, written atomically with Orbax, the last K kept.
 
 Each holds two items: `policy` (what acting needs: filter and actor) and `state` (all the rest).
 Arrays are stored under readable names in flat dictionaries; nothing is pickled.
@@ -70,9 +70,7 @@ class Checkpoints:
 
 def to_arrays(tree: Any) -> dict[str, jax.Array]:
     """Leaves by readable path; random keys as their data."""
-    return {
-        name: jax.random.key_data(leaf) if is_key(leaf) else leaf for name, leaf in named(tree)
-    }
+    return {name: jax.random.key_data(leaf) if is_key(leaf) else leaf for name, leaf in named(tree)}
 
 
 def from_arrays(like: T, arrays: dict[str, Any]) -> T:

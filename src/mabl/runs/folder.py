@@ -1,11 +1,11 @@
 """A run's folder: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP with config, versions, metrics, checkpoints.
 
-    config.yaml      every field of the configuration
-    versions.yaml    package versions, git commit, machine
-    metrics.jsonl    one JSON object a line, `step` in environment steps
-    curves.png       refreshed during training
-    tensorboard/     the same metrics
-    checkpoints/     the newest last
+config.yaml      every field of the configuration
+versions.yaml    package versions, git commit, machine
+metrics.jsonl    one JSON object a line, `step` in environment steps
+curves.png       refreshed during training
+tensorboard/     the same metrics
+checkpoints/     the newest last
 """
 
 import dataclasses
@@ -58,7 +58,7 @@ def read_config(folder: Path) -> Config:
     """The configuration of a run. Raises UserError if the folder is not a run."""
     path = folder / "config.yaml"
     if not path.is_file():
-        raise UserError(f"{folder} is not a run folder (no config.yaml): give one made by mabl train")
+        raise UserError(f"{folder} is not a run folder (no config.yaml): give one of mabl train's")
     try:
         data = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError) as error:
