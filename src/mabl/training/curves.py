@@ -47,6 +47,7 @@ def draw(rows: list[Row], title: str, path: Path) -> None:
                 axis.plot(steps, values, label=name.split("/")[1], linewidth=1.5)
         axis.set_title(panel, fontsize=10)
         axis.set_xlabel("environment steps", fontsize=9)
+        axis.locator_params(axis="x", nbins=5)
         axis.grid(alpha=0.3)
         if axis.lines:
             axis.legend(fontsize=8, frameon=False)
