@@ -8,9 +8,9 @@ from mabl.envs.counting import CountingEnv
 
 
 def test_unexplained_is_squared_error_over_variance_where_the_mask_holds():
-    real = jnp.array([[[0.0], [2.0], [4.0], [99.0]]])
-    predicted = jnp.array([[[1.0], [2.0], [3.0], [0.0]]])
-    mask = jnp.array([[True, True, True, False]])
+    real = jnp.array([0.0, 2.0, 4.0, 99.0]).reshape(1, 4, 1, 1)  # [B, T, N, F]
+    predicted = jnp.array([1.0, 2.0, 3.0, 0.0]).reshape(1, 4, 1, 1)
+    mask = jnp.array([True, True, True, False]).reshape(1, 4, 1)
     assert unexplained(predicted, real, mask) == pytest.approx(2 / 8)  # (1 + 0 + 1) / (4 + 0 + 4)
     assert unexplained(jnp.full_like(real, 2.0), real, mask) == pytest.approx(1.0)
     assert unexplained(real, real, mask) == 0.0
@@ -26,14 +26,17 @@ def test_open_loop_error_compares_row_t_plus_k_and_skips_episode_boundaries():
     real = jnp.arange(6.0)[None, :, None, None]  # [B, T, N, F]
     starts = jnp.arange(4.0)[None, :, None, None]
     exact = jnp.stack([starts + 1, starts + 2])  # [K, B, W, N, F]
-    assert open_loop_error(exact, real, rows, 1) == 0.0
-    assert open_loop_error(exact, real, rows, 2) == 0.0
+    everywhere = jnp.ones((1, length, 1), bool)
+    assert open_loop_error(exact, real, everywhere, rows, 1) == 0.0
+    assert open_loop_error(exact, real, everywhere, rows, 2) == 0.0
     # Two steps ahead, rows 2 and 3 lead into the next episode: being wrong there is no error.
     wrong = exact.at[1, 0, 2:].add(100.0)
-    assert open_loop_error(wrong, real, rows, steps) == 0.0
+    assert open_loop_error(wrong, real, everywhere, rows, steps) == 0.0
     # Rows 0 and 1 lead to 2 and 3, variance 0.5 in all; one of them off by 1.
     off = exact.at[1, 0, 0].add(1.0)
-    assert open_loop_error(off, real, rows, steps) == pytest.approx(1 / 0.5)
+    assert open_loop_error(off, real, everywhere, rows, steps) == pytest.approx(1 / 0.5)
+    # ... unless the mask leaves out the row that it leads to.
+    assert open_loop_error(off, real, everywhere.at[0, 2].set(False), rows, steps) == 0.0
 
 
 def test_masked_mean():

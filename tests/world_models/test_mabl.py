@@ -55,7 +55,7 @@ def observed(model: MABL, rows: TimeStep, seed: int = 1):
     """Latents, posterior and prior logits, predictions of one sequence."""
     key_observe, key_prior = jax.random.split(jax.random.key(seed))
     latents, posterior = observe_sequence(model, rows, key_observe)
-    prior = jax.vmap(model.prior)(latents, jax.random.split(key_prior, len(rows.is_first)))
+    _, prior = jax.vmap(model.prior)(latents, jax.random.split(key_prior, len(rows.is_first)))
     return latents, posterior, prior, jax.vmap(model.predict)(latents)
 
 
@@ -212,28 +212,28 @@ def test_global_posterior_sees_the_state_the_agents_own_sample_and_h(model):
 
 def test_agent_prior_depends_on_the_sample_of_the_global_prior(model):
     latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
-    one, other = (model.prior(latent, jax.random.key(seed)) for seed in (0, 1))
+    one, other = (model.prior(latent, jax.random.key(seed))[1] for seed in (0, 1))
     assert_array_equal(one["global"], other["global"])
     assert not np.allclose(one["agent"], other["agent"])
     # The posterior sample is not an input of it ...
     moved = latent._replace(global_=latent.global_._replace(z=latent.global_.z[:, ::-1]))
-    assert_array_equal(model.prior(moved, jax.random.key(0))["agent"], one["agent"])
+    assert_array_equal(model.prior(moved, jax.random.key(0))[1]["agent"], one["agent"])
 
 
 def test_agent_prior_input_posterior_takes_the_posterior_sample_instead():
     model = build(agent_prior_input="posterior")
     latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
-    one, other = (model.prior(latent, jax.random.key(seed)) for seed in (0, 1))
+    one, other = (model.prior(latent, jax.random.key(seed))[1] for seed in (0, 1))
     assert_array_equal(one["agent"], other["agent"])
     moved = latent._replace(global_=latent.global_._replace(z=latent.global_.z[:, ::-1]))
-    assert not np.allclose(model.prior(moved, jax.random.key(0))["agent"], one["agent"])
+    assert not np.allclose(model.prior(moved, jax.random.key(0))[1]["agent"], one["agent"])
 
 
 def test_priors_do_not_see_the_row_they_predict(model):
     # The row's own z is not an input of either prior: only h, which precedes it.
     latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
     moved = latent._replace(agent=latent.agent._replace(z=latent.agent.z[:, ::-1]))
-    before, after = (model.prior(x, jax.random.key(0)) for x in (latent, moved))
+    before, after = (model.prior(x, jax.random.key(0))[1] for x in (latent, moved))
     assert_array_equal(before["agent"], after["agent"])
     assert_array_equal(before["global"], after["global"])
 
@@ -349,7 +349,10 @@ def test_the_action_of_a_first_row_does_not_matter(losses_of):
 
 
 class Rigged(eqx.Module):
-    """A model that predicts zeros, with one level of two categoricals of known logits."""
+    """A model that decodes its latent: 0 from posteriors, 1 from priors.
+
+    It has one level, of two categoricals with known logits.
+    """
 
     n_agents: int = eqx.field(static=True)
 
@@ -363,21 +366,20 @@ class Rigged(eqx.Module):
         return latent, {"level": self.logits([0.5, 0.5], [0.9, 0.1])}
 
     def prior(self, latent, key):
-        return {"level": self.logits([0.25, 0.75], [0.5, 0.5])}
+        return jnp.ones(self.n_agents), {"level": self.logits([0.25, 0.75], [0.5, 0.5])}
 
     def logits(self, *probs):
         logits = jnp.log(jnp.array(probs))
         return jnp.broadcast_to(logits, (self.n_agents, *logits.shape))
 
     def predict(self, latent):
-        zeros = jnp.zeros(self.n_agents)
         return Predictions(
-            obs=jnp.zeros((self.n_agents, 4)),
-            reward=zeros,
-            agent_reward=zeros + 1.0,
-            terminated=zeros,
-            available=jnp.zeros((self.n_agents, 3)),
-            action=jnp.zeros((self.n_agents, 3)),
+            obs=jnp.tile(latent[:, None], 4),
+            reward=latent,
+            agent_reward=latent + 1.0,
+            terminated=latent,
+            available=jnp.tile(latent[:, None], 3),
+            action=jnp.tile(latent[:, None], 3),
         )
 
 
@@ -421,6 +423,42 @@ def test_the_agents_own_reward_predictor_is_trained_beside_one_that_sees_both_le
     # It predicts 1: Huber of errors 1, 1, 1, 1, 0.5, 1
     assert_allclose(terms["agent_reward"], (5 * 0.5 + 0.125) / 6, rtol=1e-5)
     assert_allclose(terms["reward"], 3.125 / 6, rtol=1e-5)
+
+
+def test_overshooting_trains_the_decoders_on_what_the_prior_predicts():
+    rows = some_rows(2)._replace(
+        obs=jnp.array([[[1.0, 0, 0, 0]] * 3, [[3.0, 1.0, 0, 0]] * 3]),
+        reward=jnp.array([[0.0, 0.0, 0.0], [2.0, 0.5, 2.0]]),
+        terminated=jnp.array([[False] * 3, [True, True, False]]),
+    )
+    without = rigged_loss(batched(rows))
+    terms = rigged_loss(batched(rows), overshooting=0.5, obs_weight=2.0)
+    # Everything predicted is 1. Huber of 0, 1, 1, 1 and of 2, 0, 1, 1: 1.5 and 2.5, times 0.5 * 2
+    assert_allclose(terms["ahead_obs"], 2.0, rtol=1e-5)
+    # Huber of 1, 1, 1 and of 1, 0.5, 1
+    assert_allclose(terms["ahead_reward"], 0.5 * (5 * 0.5 + 0.125) / 6, rtol=1e-5)
+    # Two of six terminated: log(1 + e) without, log(1 + 1/e) with
+    assert_allclose(
+        terms["ahead_terminated"],
+        0.5 * (4 * np.log1p(np.e) + 2 * np.log1p(1 / np.e)) / 6,
+        rtol=1e-5,
+    )
+    assert_allclose(terms["obs"], 2 * without["obs"], rtol=1e-5)
+    for name in ("reward", "terminated", "available", "action", "kl_level"):
+        assert terms[name] == without[name], name
+    assert not any(name.startswith("ahead") for name in without)
+
+
+def test_overshooting_trains_both_priors_and_what_they_rest_on():
+    def ahead(model: MABL, rows: TimeStep) -> jax.Array:
+        config = replace(model.config, overshooting=1.0, kl_weight=0.0)
+        _, metrics = model_loss(model, batched(rows), jax.random.key(0), config, SPEC.action_space)
+        names = [name for name in metrics if "loss_ahead" in name]
+        return jnp.stack([metrics[name] for name in names]).sum()
+
+    gradient = eqx.filter_jit(eqx.filter_grad(ahead))(build(), some_rows(3))
+    for name in (*GLOBAL, "filter", "agent_prior", "heads"):
+        assert max(jnp.abs(x).max() for x in jax.tree.leaves(getattr(gradient, name))) > 0, name
 
 
 def test_dead_agents_neither_teach_observations_nor_actions():

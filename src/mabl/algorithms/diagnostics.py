@@ -27,14 +27,18 @@ def diagnose(
     `posterior` metrics decode the latent that has seen the row; `prior` ones the latent predicted
     for it one step before. Open-loop errors predict k steps ahead from real actions alone, and are
     relative: 1 is as bad as always predicting the mean, 0 is perfect. Everything stays within
-    episodes.
+    episodes; observations are those of the living.
     """
+    everywhere = jnp.ones_like(rows.alive)
     posterior = jax.vmap(jax.vmap(model.predict))(latents)
     wins = jnp.nan_to_num(rows.score) > 0
     metrics = {
-        "world_model/reconstruction": optax.squared_error(posterior.obs, rows.obs).mean(),
+        "world_model/reconstruction": masked_mean(
+            optax.squared_error(posterior.obs, rows.obs).mean(-1), rows.alive
+        ),
+        "world_model/obs_unexplained_posterior": unexplained(posterior.obs, rows.obs, rows.alive),
         "world_model/reward_unexplained_posterior": unexplained(
-            posterior.reward, rows.reward, jnp.ones_like(rows.is_first)
+            posterior.reward[..., None], rows.reward[..., None], everywhere
         ),
         "world_model/reward_on_wins": masked_mean(posterior.reward.mean(-1), wins),
         "world_model/reward_on_wins_real": masked_mean(rows.reward.mean(-1), wins),
@@ -44,9 +48,11 @@ def diagnose(
     ahead = open_loop(model, latents, rows, key, action_space, max(OPEN_LOOP_STEPS))
     ahead_reward, reward = ahead.reward[..., None], rows.reward[..., None]
     for k in OPEN_LOOP_STEPS:
-        metrics[f"world_model/open_loop_obs_{k}"] = open_loop_error(ahead.obs, rows.obs, rows, k)
+        metrics[f"world_model/open_loop_obs_{k}"] = open_loop_error(
+            ahead.obs, rows.obs, rows.alive, rows, k
+        )
         metrics[f"world_model/open_loop_reward_{k}"] = open_loop_error(
-            ahead_reward, reward, rows, k
+            ahead_reward, reward, everywhere, rows, k
         )
     metrics["world_model/reward_unexplained_prior"] = metrics["world_model/open_loop_reward_1"]
     return metrics
@@ -81,22 +87,25 @@ def open_loop(
 
 
 def open_loop_error(
-    predicted: Float[Array, "K B W N F"], real: Float[Array, "B T N F"], rows: TimeStep, k: int
+    predicted: Float[Array, "K B W N F"],
+    real: Float[Array, "B T N F"],
+    mask: Bool[Array, "B T N"],
+    rows: TimeStep,
+    k: int,
 ) -> Float[Array, ""]:
-    """Squared error k steps ahead over the variance of the target, within episodes."""
+    """Squared error k steps ahead over the variance of the target, within episodes and `mask`."""
     n_starts = predicted.shape[2]
-    target = real[:, k : k + n_starts]
+    target, mask = real[:, k : k + n_starts], mask[:, k : k + n_starts]
     resets = jnp.cumsum(rows.is_first, axis=1)
     same_episode = resets[:, k : k + n_starts] == resets[:, :n_starts]
-    return unexplained(predicted[k - 1], target, same_episode)
+    return unexplained(predicted[k - 1], target, mask & same_episode[..., None])
 
 
 def unexplained(
-    predicted: Float[Array, "B T ..."], real: Float[Array, "B T ..."], mask: Bool[Array, "B T"]
+    predicted: Float[Array, "B T N F"], real: Float[Array, "B T N F"], mask: Bool[Array, "B T N"]
 ) -> Float[Array, ""]:
     """Share of the target's variance that the prediction leaves: 1 - R^2."""
-    weight = mask.reshape(*mask.shape, *[1] * (real.ndim - 2)).astype(jnp.float32)
-    weight = jnp.broadcast_to(weight, real.shape)
+    weight = jnp.broadcast_to(mask[..., None], real.shape).astype(jnp.float32)
     total = weight.sum((0, 1), keepdims=True) + 1e-8
     mean = (weight * real).sum((0, 1), keepdims=True) / total
     return (weight * (predicted - real) ** 2).sum() / ((weight * (real - mean) ** 2).sum() + 1e-8)

@@ -26,7 +26,7 @@ PAPER_MODEL_LEARNING_RATE = {"smax/3s_vs_5z": 5e-4}
 QUICK = {
     "smax": Config(
         preset="quick",
-        total_steps=80_000,
+        total_steps=75_000,
         training=TrainingConfig(
             num_envs=16,
             collect_steps=16,
@@ -41,10 +41,12 @@ QUICK = {
             hidden=128,
             n_categoricals=8,
             n_classes=8,
+            obs_weight=4.0,
             reward_input="both",
             reward_loss="mse",
             kl_reduction="sum",
             kl_weight=0.1,
+            overshooting=1.0,
             learning_rate=1e-3,
             batch_size=16,
         ),

@@ -34,6 +34,8 @@ class WorldModelConfig:
     """Classes of each categorical."""
     agent_prior_input: Literal["prior", "posterior"] = "prior"
     """Global sample behind the agent prior in training (sec. 3.2: prior, app. A: posterior)."""
+    obs_weight: float = 1.0
+    """Weight of the observations' loss: 1 / variance of their likelihood."""
     reward_input: Literal["agent", "both"] = "agent"
     """What imagination's reward predictor sees: (z_agent, h_agent) as in the paper, or both levels;
     then the agent's own predictor is trained beside it."""
@@ -53,6 +55,8 @@ class WorldModelConfig:
     """KL balancing, entropy weight: keeps the posterior near the prior."""
     free_nats: float = 0.0
     """Reduced KL of a level below which it is not trained."""
+    overshooting: float = 0.0
+    """Weight of the decoders' losses on prior latents, one step ahead (ADR 7); 0 in the paper."""
     learning_rate: float = 3e-4
     """Adam's learning rate (Table 4)."""
     grad_clip: float = 100.0
@@ -66,7 +70,8 @@ class WorldModelConfig:
         require_positive(self, "hidden", "n_hidden", "n_categoricals", "n_classes", "batch_size")
         require_positive(self, "batch_length", "learning_rate", "grad_clip")
         require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
-        require_between(self, 0, inf, "free_nats", "reward_weight", "agent_reward_weight")
+        require_between(self, 0, inf, "free_nats", "obs_weight", "overshooting")
+        require_between(self, 0, inf, "reward_weight", "agent_reward_weight")
 
 
 class WorldModel(Protocol[L]):
@@ -89,8 +94,8 @@ class WorldModel(Protocol[L]):
         """Posterior latent of the next row and its logits by level."""
         ...
 
-    def prior(self, latent: L, key: PRNGKey) -> dict[str, Array]:
-        """Prior logits by level, from the deterministic part of a row's latent."""
+    def prior(self, latent: L, key: PRNGKey) -> tuple[L, dict[str, Array]]:
+        """Prior latent of a row and its logits by level, from the row's deterministic part."""
         ...
 
     def imagine(self, latent: L, action: Float[Array, "N A"], key: PRNGKey) -> L:
@@ -134,8 +139,9 @@ def model_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """L(psi) = L_ELBO + L_reward + L_termination + L_available + L_action (section 3.2).
 
-    `rows` are `[B, T, ...]`. Losses are sums over features and means over B, T and N; observations
-    and actions of dead agents do not count, nor does the action before a first row.
+    `rows` are `[B, T, ...]`. Losses are sums over features and means over B, T and N. With
+    `config.overshooting` the decoders also see the latent that the prior predicts for each row from
+    the row before: what imagination decodes, which the KL alone would train.
     """
     batch, length = rows.is_first.shape
     key_observe, key_prior = jax.random.split(key)
@@ -143,31 +149,14 @@ def model_loss(
         model, rows, jax.random.split(key_observe, batch)
     )
     keys_prior = jax.random.split(key_prior, (batch, length))
-    prior = jax.vmap(jax.vmap(model.prior))(latents, keys_prior)
+    prior_latents, prior = jax.vmap(jax.vmap(model.prior))(latents, keys_prior)
     predicted = jax.vmap(jax.vmap(model.predict))(latents)
 
-    alive = rows.alive.astype(jnp.float32)
-    acted = alive * ~rows.is_first[..., None]
-    losses = {
-        "obs": (alive * optax.huber_loss(predicted.obs, rows.obs).sum(-1)).mean(),
-        "reward": config.reward_weight
-        * reward_loss(predicted.reward, rows.reward, config.reward_loss).mean(),
-        "terminated": optax.sigmoid_binary_cross_entropy(
-            predicted.terminated, rows.terminated.astype(jnp.float32)
-        ).mean(),
-        "available": optax.sigmoid_binary_cross_entropy(
-            predicted.available, rows.available.astype(jnp.float32)
-        )
-        .sum(-1)
-        .mean(),
-        "action": (acted * action_loss(predicted.action, rows.prev_action, action_space)).mean(),
-    }
-    if config.reward_input == "both":
-        losses["agent_reward"] = (
-            config.agent_reward_weight
-            * config.reward_weight
-            * reward_loss(predicted.agent_reward, rows.reward, config.reward_loss).mean()
-        )
+    losses = decoder_losses(predicted, rows, config, action_space)
+    if config.overshooting:
+        ahead = jax.vmap(jax.vmap(model.predict))(prior_latents)
+        for name, loss in decoder_losses(ahead, rows, config, action_space).items():
+            losses[f"ahead_{name}"] = config.overshooting * loss
     for level in posterior:
         losses[f"kl_{level}"] = (
             config.kl_weight
@@ -187,6 +176,35 @@ def model_loss(
         nats = categorical_kl(posterior[level], prior[level]).sum(-1).mean()
         metrics[f"world_model/kl_{level}"] = nats
     return total, metrics
+
+
+def decoder_losses(
+    predicted: Predictions, rows: TimeStep, config: WorldModelConfig, action_space: ActionSpace
+) -> dict[str, Float[Array, ""]]:
+    """-log likelihoods of rows `[B, T, ...]` under what is decoded from their latents, weighted.
+
+    Observations and actions of dead agents do not count, nor does the action before a first row.
+    """
+    alive = rows.alive.astype(jnp.float32)
+    acted = alive * ~rows.is_first[..., None]
+    losses = {
+        "obs": config.obs_weight * (alive * optax.huber_loss(predicted.obs, rows.obs).sum(-1)),
+        "reward": config.reward_weight
+        * reward_loss(predicted.reward, rows.reward, config.reward_loss),
+        "terminated": optax.sigmoid_binary_cross_entropy(
+            predicted.terminated, rows.terminated.astype(jnp.float32)
+        ),
+        "available": optax.sigmoid_binary_cross_entropy(
+            predicted.available, rows.available.astype(jnp.float32)
+        ).sum(-1),
+        "action": acted * action_loss(predicted.action, rows.prev_action, action_space),
+    }
+    if config.reward_input == "both":
+        weight = config.agent_reward_weight * config.reward_weight
+        losses["agent_reward"] = weight * reward_loss(
+            predicted.agent_reward, rows.reward, config.reward_loss
+        )
+    return {name: loss.mean() for name, loss in losses.items()}
 
 
 def reward_loss(

@@ -110,23 +110,19 @@ class MABL(eqx.Module):
         keys = jax.random.split(key, self.spec.n_agents)
         return jax.vmap(observe_agent)(latent, prev_action, inputs.obs, keys)
 
-    def prior(self, latent: Latent, key: PRNGKey) -> dict[str, Float[Array, "N K C"]]:
-        """Prior logits by level for the row whose embeddings `latent` holds (transition model).
+    def prior(
+        self, latent: Latent, key: PRNGKey
+    ) -> tuple[Latent, dict[str, Float[Array, "N K C"]]]:
+        """Prior latent of the row whose embeddings `latent` holds, and its logits by level.
 
         p(z^g_t | h^g_t) and p(z^a_t | h^a_t, z^g_t) with z^g_t a sample of the global prior
         (section 3.2; `config.agent_prior_input` can make it the posterior sample of appendix A).
         """
+        by_posterior = self.config.agent_prior_input == "posterior"
 
-        def prior_agent(latent: Latent, key: PRNGKey) -> dict[str, Array]:
-            global_logits = self.global_prior(latent.global_.h)
-            z_global = {
-                "prior": draw(global_logits, key),
-                "posterior": latent.global_.z,
-            }[self.config.agent_prior_input]
-            return {
-                "agent": self.agent_prior(latent.agent.h, z_global),
-                "global": global_logits,
-            }
+        def prior_agent(latent: Latent, key: PRNGKey) -> tuple[Latent, dict[str, Array]]:
+            given = latent.global_.z if by_posterior else None
+            return self._transition(latent.agent.h, latent.global_.h, key, given)
 
         return jax.vmap(prior_agent)(latent, jax.random.split(key, self.spec.n_agents))
 
@@ -138,15 +134,33 @@ class MABL(eqx.Module):
         joint_action = action.ravel()
 
         def imagine_agent(latent: Latent, action: Array, key: PRNGKey) -> Latent:
-            key_agent, key_global = jax.random.split(key)
-            h_global = self.global_recurrent(latent.global_, joint_action)
-            z_global = draw(self.global_prior(h_global), key_global)
             h_agent = self.filter.recurrent(latent.agent, action)
-            z_agent = draw(self.agent_prior(h_agent, z_global), key_agent)
-            return Latent(Level(h_agent, z_agent), Level(h_global, z_global))
+            h_global = self.global_recurrent(latent.global_, joint_action)
+            return self._transition(h_agent, h_global, key)[0]
 
         keys = jax.random.split(key, self.spec.n_agents)
         return jax.vmap(imagine_agent)(latent, action, keys)
+
+    def _transition(
+        self,
+        h_agent: Float[Array, " D"],
+        h_global: Float[Array, " D"],
+        key: PRNGKey,
+        z_global: Float[Array, " KC"] | None = None,
+    ) -> tuple[Latent, dict[str, Float[Array, "K C"]]]:
+        """One agent's transition model: a sample and its logits.
+
+        The agent's prior is given the global sample, or `z_global`.
+        """
+        key_agent, key_global = jax.random.split(key)
+        global_logits = self.global_prior(h_global)
+        sample = draw(global_logits, key_global)
+        agent_logits = self.agent_prior(h_agent, sample if z_global is None else z_global)
+        agent = Level(h_agent, draw(agent_logits, key_agent))
+        return Latent(agent, Level(h_global, sample)), {
+            "agent": agent_logits,
+            "global": global_logits,
+        }
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent: fields `[N, ...]`.
