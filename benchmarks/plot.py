@@ -1,6 +1,7 @@
 """Learning curves of run folders, and of the PPO yardstick, with min-max shading over seeds.
 
-    uv run python -m benchmarks.plot --runs 'runs/smax/3m/mabl/*/*' --ppo ppo.json --out 3m.png
+    uv run python -m benchmarks.plot --runs 'MABL=runs/smax/3m/mabl/*/*' \\
+        --ppo MAPPO=ppo.json --out 3m.png
 
 The win rate at a step is that of the training episodes in the window of steps before it.
 """
@@ -48,7 +49,7 @@ def win_rate(curve: tuple[np.ndarray, np.ndarray, np.ndarray], grid: np.ndarray)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", nargs="*", default=[], help="LABEL=GLOB of run folders")
-    parser.add_argument("--ppo", help="output of benchmarks/ppo.py")
+    parser.add_argument("--ppo", nargs="*", default=[], help="LABEL=output of benchmarks/ppo.py")
     parser.add_argument("--title", default="")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
@@ -56,9 +57,10 @@ def main() -> None:
     for item in args.runs:
         label, pattern = item.split("=", 1)
         groups[label] = [run_curve(Path(path)) for path in sorted(glob(pattern))]
-    if args.ppo:
-        curves = json.loads(Path(args.ppo).read_text())["curves"]
-        groups["PPO on real data"] = [ppo_curve(curve) for curve in curves.values()]
+    for item in args.ppo:
+        label, path = item.split("=", 1)
+        curves = json.loads(Path(path).read_text())["curves"]
+        groups[label] = [ppo_curve(curve) for curve in curves.values()]
 
     longest = max(curve[0][-1] for curves in groups.values() for curve in curves)
     grid = np.arange(1_000, longest + 1, 1_000)

@@ -255,3 +255,26 @@ def test_no_gradient_flows_through_imagination():
         return trajectory.log_prob.sum()
 
     assert jax.grad(total)(1.0) == 0
+
+
+class Doubtful(Clockwork):
+    """A world model that believes in every action with probability 0.6."""
+
+    def predict(self, latent):
+        return super().predict(latent)._replace(available=jnp.full((2, 3), jnp.log(1.5)))
+
+
+@pytest.mark.parametrize(("sample", "share"), [(True, 0.6), (False, 1.0)])
+def test_imagined_availability_is_a_sample_or_the_mode(sample, share):
+    trajectory = imagine_trajectory(
+        Doubtful(),  # pyright: ignore[reportArgumentType]
+        lambda features, available: MaskedCategorical.of(jnp.zeros(3), available),  # pyright: ignore
+        Counter(jnp.array([0, 0]), jnp.array([0, 0])),
+        jnp.ones((2, 3), bool),
+        jnp.float32(1.0),
+        jax.random.key(0),
+        200,
+        Discrete(3),
+        sample,
+    )
+    assert_allclose(trajectory.available[1:].mean(), share, atol=0.05)

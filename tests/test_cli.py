@@ -6,11 +6,13 @@ import shutil
 import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mabl import Policy, UserError, cli
+from mabl.runs import folder as run_folder
 
 TINY = [
     "--env=test/coordination",
@@ -105,6 +107,24 @@ def test_a_replay_that_cannot_fit_is_refused_before_it_is_allocated(mabl, tmp_pa
     huge = "--training.replay-capacity=1000000000000"
     code, _, err = mabl("train", *TINY, huge, f"--logdir={tmp_path}")
     assert code == 2 and "the replay needs" in err and not list(tmp_path.iterdir())
+
+
+def test_a_resume_that_cannot_fit_is_refused_too(trained, mabl, monkeypatch):
+    monkeypatch.setattr("mabl.training.run.free_memory", lambda: 1)
+    code, _, err = mabl("resume", trained, "--total-steps=900")
+    assert code == 2 and "the replay needs" in err
+
+
+def test_runs_that_start_within_a_second_get_folders_of_their_own(tmp_path):
+    names = [run_folder.make_unused(tmp_path, "20260101-120000").name for _ in range(3)]
+    assert names == ["20260101-120000", "20260101-120000-2", "20260101-120000-3"]
+
+
+def test_the_commit_is_that_of_a_checkout_of_mabl_or_unknown(monkeypatch, tmp_path):
+    checkout = Path(run_folder.__file__).parents[3]
+    assert (run_folder.git_commit() != "unknown") == (checkout / ".git").exists()
+    monkeypatch.setattr("mabl.runs.folder.__file__", str(tmp_path / "a/b/c/folder.py"))
+    assert run_folder.git_commit() == "unknown"
 
 
 def test_a_run_folder_holds_what_the_documentation_says(trained):

@@ -14,6 +14,7 @@ import platform
 import subprocess
 from dataclasses import replace
 from datetime import datetime
+from itertools import count
 from pathlib import Path
 
 import yaml
@@ -34,8 +35,7 @@ def create(config: Config, seed: int) -> Path:
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:
         parent.mkdir(parents=True, exist_ok=True)
-        folder = unused(parent, stamp)
-        folder.mkdir()
+        folder = make_unused(parent, stamp)
         write_config(folder, config)
         write_yaml(folder / "versions.yaml", versions())
     except OSError as error:
@@ -45,13 +45,16 @@ def create(config: Config, seed: int) -> Path:
     return folder
 
 
-def unused(parent: Path, stamp: str) -> Path:
-    """`parent/stamp`, with a suffix if two runs start within a second."""
-    folder, n = parent / stamp, 1
-    while folder.exists():
-        n += 1
-        folder = parent / f"{stamp}-{n}"
-    return folder
+def make_unused(parent: Path, stamp: str) -> Path:
+    """Make `parent/stamp`, with a suffix if other runs start within the same second."""
+    for n in count(1):
+        folder = parent / (stamp if n == 1 else f"{stamp}-{n}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise AssertionError("unreachable")
 
 
 def read_config(folder: Path) -> Config:
@@ -94,10 +97,13 @@ def versions() -> dict[str, str]:
 
 def git_commit() -> str:
     """The commit of mabl's source tree, or `unknown` outside a checkout."""
+    checkout = Path(__file__).parents[3]
+    if not (checkout / ".git").exists():  # an installed package may lie in someone else's tree
+        return "unknown"
     try:
         return subprocess.run(
             ["git", "describe", "--always", "--dirty", "--abbrev=12"],
-            cwd=Path(__file__).parent,
+            cwd=checkout,
             capture_output=True,
             text=True,
             check=True,

@@ -23,9 +23,7 @@ class TrainState(NamedTuple):
     collectors: Collector
     key: PRNGKey
     env_steps: Int[Array, ""]
-    cycles: Int[Array, ""]
     model_updates: Int[Array, ""]
-    policy_updates: Int[Array, ""]
 
 
 class Training(NamedTuple):
@@ -45,7 +43,7 @@ class Training(NamedTuple):
         )
         capacity = config.replay_capacity // config.num_envs
         replay = jax.vmap(lambda row: replays.empty(row, capacity))(collectors.row)
-        return TrainState(learner, replay, collectors, key, *[jnp.int32(0)] * 4)
+        return TrainState(learner, replay, collectors, key, jnp.int32(0), jnp.int32(0))
 
     def cycle(
         self, state: TrainState, n_model: Int[Array, ""], n_policy: Int[Array, ""]
@@ -76,9 +74,7 @@ class Training(NamedTuple):
             collectors=collectors,
             key=key,
             env_steps=state.env_steps + steps_in(collected),
-            cycles=state.cycles + 1,
             model_updates=state.model_updates + n_model,
-            policy_updates=state.policy_updates + n_policy,
         )
         return state, model_metrics | policy_metrics | episode_sums(collected)
 

@@ -48,14 +48,7 @@ def train(config: Config, console: Console | None = None) -> Outcome:
     console = console or Console(stderr=True)
     training = build(config)
     seeds = range(config.seed, config.seed + config.num_seeds)
-    shape = jax.eval_shape(training.init, jax.random.key(0))
-    needed = config.num_seeds * tree_bytes(shape.replay)
-    console.print(
-        f"{config.algo} on {config.env}: replay {needed / 2**20:,.0f} MiB, parameters and "
-        f"optimisers {config.num_seeds * tree_bytes(shape.learner) / 2**20:,.0f} MiB",
-        highlight=False,
-    )
-    check_memory(needed, free_memory())
+    check_fits(training, config.num_seeds, console)
     folders = [folder.create(config, seed) for seed in seeds]
     for path in folders:
         console.print(f"run folder {path}", highlight=False, soft_wrap=True)
@@ -80,6 +73,7 @@ def resume(
             f"{path} has already done {checkpoints.latest} of {config.total_steps} steps: "
             "give a larger --total-steps"
         )
+    check_fits(training, 1, console)
     shape = jax.eval_shape(training.init, jax.random.key(0))
     state = checkpoints.restore("state", shape)
     folder.write_config(path, config)
@@ -91,6 +85,19 @@ def resume(
         console,
         resumed=True,
     )
+
+
+def check_fits(training: Training, num_seeds: int, console: Console) -> None:
+    """Say how much memory a run takes. Raises UserError if its replay does not fit."""
+    config = training.algorithm.config
+    shape = jax.eval_shape(training.init, jax.random.key(0))
+    replay, learner = num_seeds * tree_bytes(shape.replay), num_seeds * tree_bytes(shape.learner)
+    console.print(
+        f"{config.algo} on {config.env}: replay {replay / 2**20:,.0f} MiB, parameters and "
+        f"optimisers {learner / 2**20:,.0f} MiB",
+        highlight=False,
+    )
+    check_memory(replay, free_memory())
 
 
 def build(config: Config) -> Training:
@@ -124,11 +131,13 @@ def _run(
     console.print("compiling (cached for the next run) ...", highlight=False)
     with (
         _Interruption(console) as interruption,
-        Progress(console, total_steps, training.env.spec.score_name, step) as progress,
+        Progress(console, total_steps, training.env.spec.score_name) as progress,
     ):
         while step < total_steps and not interruption.requested:
             before, cycle_began = step, time.monotonic()
             n_model, n_policy = updates_due(states, config)
+            if n_model and not n_policy:
+                console.print(f"pretraining the model: {n_model} updates ...", highlight=False)
             states, metrics = program(states, n_model, n_policy)
             step = int(states.env_steps.min())
             if longest_lane(states) >= DIAGNOSED_ROWS and crossed(
