@@ -55,13 +55,15 @@ def environments(replay: Replay, which: slice) -> Replay:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path)
-    parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE")
-    parser.add_argument("--model-updates", type=int, default=1000)
-    parser.add_argument("--policy-updates", type=int, default=0)
+    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
+    parser.add_argument("--model-updates", type=int, default=1000, help="in fifties")
+    parser.add_argument("--policy-updates", type=int, default=0, help="in fifties")
     parser.add_argument("--every", type=int, default=250, help="model updates between reports")
     parser.add_argument("--episodes", type=int, default=256)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
+    if args.model_updates % CHUNK or args.policy_updates % CHUNK:
+        parser.error(f"give updates in multiples of {CHUNK}")
     use_compilation_cache()
 
     config = folder.read_config(args.run)
@@ -80,9 +82,9 @@ def main() -> None:
 
     def fit(update: Callable) -> Callable:
         @jax.jit
-        def chunk(learner: Learner, key: PRNGKey) -> Learner:
+        def chunk(learner: Learner, rows: Replay, key: PRNGKey) -> Learner:
             keys = jax.random.split(key, CHUNK)
-            return jax.lax.scan(lambda carry, key: update(carry, trained, key), learner, keys)[0]
+            return jax.lax.scan(lambda carry, key: update(carry, rows, key), learner, keys)[0]
 
         return chunk
 
@@ -96,13 +98,13 @@ def main() -> None:
             print(json.dumps({"model_updates": n, "rows": name, **row}), flush=True)
 
     for n in range(CHUNK, args.model_updates + 1, CHUNK):
-        learner = fit_model(learner, jax.random.fold_in(key_model, n))
+        learner = fit_model(learner, trained, jax.random.fold_in(key_model, n))
         if n % args.every == 0:
             report(n)
-    if args.model_updates == 0:
-        report(0)
+    if args.model_updates % args.every or args.model_updates == 0:
+        report(args.model_updates)
     for n in range(CHUNK, args.policy_updates + 1, CHUNK):
-        learner = fit_policy(learner, jax.random.fold_in(key_policy, n))
+        learner = fit_policy(learner, trained, jax.random.fold_in(key_policy, n))
         executor = algorithm.executor(algorithm.policy(learner), greedy=True)
         results = evaluate(training.env, executor, key_play, args.episodes)
         played = {k: round(v, 3) for k, v in summary(results, training.env.spec).items()}

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import threading
 import time
 from pathlib import Path
@@ -68,6 +69,14 @@ MISTAKES = {
     "negative": (["train", "--training.model-updates=-1"], "--training.model-updates is -1"),
     "capacity": (["train", "--training.replay-capacity=16"], "--training.replay-capacity 16"),
     "heads": (["train", "--mappo.hidden=30"], "--mappo.hidden is 30: give a multiple of its 8"),
+    "overshooting": (
+        [
+            "train",
+            "--world-model.overshooting=1",
+            "--world-model.agent-prior-input=posterior",
+        ],
+        "--world-model.overshooting decodes what imagination would draw",
+    ),
     "no folder": (["eval", "nowhere"], "nowhere is not a run folder"),
     "resume nothing": (["resume", "nowhere"], "nowhere is not a run folder"),
     "nothing to do": (["eval"], "give either a run folder or --policy random|heuristic"),
@@ -115,15 +124,19 @@ def test_a_resume_that_cannot_fit_is_refused_too(trained, mabl, monkeypatch):
     assert code == 2 and "the replay needs" in err
 
 
-def test_runs_that_start_within_a_second_get_folders_of_their_own(tmp_path):
+def test_runs_that_start_within_a_second_get_folders_of_their_own(monkeypatch, tmp_path):
+    monkeypatch.setattr(Path, "exists", lambda path: False)  # another run is always a bit faster
     names = [run_folder.make_unused(tmp_path, "20260101-120000").name for _ in range(3)]
     assert names == ["20260101-120000", "20260101-120000-2", "20260101-120000-3"]
 
 
-def test_the_commit_is_that_of_a_checkout_of_mabl_or_unknown(monkeypatch, tmp_path):
-    checkout = Path(run_folder.__file__).parents[3]
-    assert (run_folder.git_commit() != "unknown") == (checkout / ".git").exists()
-    monkeypatch.setattr("mabl.runs.folder.__file__", str(tmp_path / "a/b/c/folder.py"))
+def test_the_commit_is_mabls_not_that_of_a_repository_it_is_installed_in(monkeypatch, tmp_path):
+    package = tmp_path / ".venv/lib/python3/site-packages/mabl/runs"
+    package.mkdir(parents=True)
+    git = ["git", "-C", tmp_path, "-c", "user.name=x", "-c", "user.email=x@example.org"]
+    subprocess.run([*git, "init", "-q"], check=True)
+    subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "theirs"], check=True)
+    monkeypatch.setattr("mabl.runs.folder.__file__", str(package / "folder.py"))
     assert run_folder.git_commit() == "unknown"
 
 

@@ -1,10 +1,15 @@
 """Diagnostics by hand: shares of variance, within episodes only."""
 
+import jax
 import jax.numpy as jnp
 import pytest
 
-from mabl.algorithms.diagnostics import masked_mean, open_loop_error, unexplained
+from mabl.algorithms.diagnostics import diagnose, masked_mean, open_loop_error, unexplained
+from mabl.envs.base import Discrete, EnvSpec
 from mabl.envs.counting import CountingEnv
+from mabl.types import Metrics, TimeStep
+from mabl.world_models.base import WorldModelConfig, observe_sequence
+from mabl.world_models.mabl import MABL
 
 
 def test_unexplained_is_squared_error_over_variance_where_the_mask_holds():
@@ -17,8 +22,6 @@ def test_unexplained_is_squared_error_over_variance_where_the_mask_holds():
 
 
 def test_open_loop_error_compares_row_t_plus_k_and_skips_episode_boundaries():
-    import jax
-
     _, row = CountingEnv().reset(jax.random.key(0))
     length, steps = 6, 2
     rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, length, *x.shape)), row)
@@ -37,6 +40,40 @@ def test_open_loop_error_compares_row_t_plus_k_and_skips_episode_boundaries():
     assert open_loop_error(off, real, everywhere, rows, steps) == pytest.approx(1 / 0.5)
     # ... unless the mask leaves out the row that it leads to.
     assert open_loop_error(off, real, everywhere.at[0, 2].set(False), rows, steps) == 0.0
+
+
+def test_the_dead_do_not_count_in_what_is_said_of_observations():
+    spec = EnvSpec("stub", 3, 4, 5, Discrete(3), 10, "score")
+    config = WorldModelConfig(hidden=8, n_hidden=1, n_categoricals=2, n_classes=3)
+    model = MABL(spec, config, jax.random.key(0))
+    shape = (2, 18, 3)
+    rows = TimeStep(
+        prev_action=jnp.zeros(shape, jnp.int32),
+        reward=jax.random.normal(jax.random.key(1), shape),
+        terminated=jnp.zeros(shape, bool),
+        truncated=jnp.zeros(shape[:2], bool),
+        obs=jax.random.normal(jax.random.key(2), (*shape, 4)),
+        state=jnp.zeros((*shape[:2], 5)),
+        available=jnp.ones((*shape, 3), bool),
+        alive=jax.random.bernoulli(jax.random.key(3), 0.7, shape),
+        is_first=jnp.zeros(shape[:2], bool).at[:, 0].set(True),
+        score=jnp.full(shape[:2], jnp.nan),
+    )
+    keys = jax.random.split(jax.random.key(4), 2)
+    latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(model, rows, keys)
+
+    @jax.jit
+    def told(rows: TimeStep) -> Metrics:
+        return diagnose(model, latents, rows, jax.random.key(5), spec.action_space)
+
+    dead = jnp.where(rows.alive[..., None], rows.obs, 99.0)
+    living = jnp.where(rows.alive[..., None], 99.0, rows.obs)
+    before = told(rows)
+    names = [n for n in before if "obs" in n or "reconstruction" in n]
+    assert len(names) == 5
+    for name in names:
+        assert told(rows._replace(obs=dead))[name] == before[name], name
+        assert told(rows._replace(obs=living))[name] != before[name], name
 
 
 def test_masked_mean():

@@ -12,7 +12,7 @@ def test_compiling_and_pretraining_do_not_count_in_the_speed(monkeypatch):
     now = 0.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
     out = io.StringIO()
-    with Progress(Console(file=out, width=200), 10_000, "win_rate") as shown:
+    with Progress(Console(file=out, width=200, force_terminal=False), 10_000, "win_rate") as shown:
         now = 60.0  # the first cycle compiles
         shown.update({"step": 100})
         assert "steps/s ?  left ?" in out.getvalue()

@@ -14,7 +14,6 @@ import platform
 import subprocess
 from dataclasses import replace
 from datetime import datetime
-from itertools import count
 from pathlib import Path
 
 import yaml
@@ -47,14 +46,14 @@ def create(config: Config, seed: int) -> Path:
 
 def make_unused(parent: Path, stamp: str) -> Path:
     """Make `parent/stamp`, with a suffix if other runs start within the same second."""
-    for n in count(1):
-        folder = parent / (stamp if n == 1 else f"{stamp}-{n}")
+    folder, n = parent / stamp, 1
+    while True:
         try:
             folder.mkdir()
+            return folder
         except FileExistsError:
-            continue
-        return folder
-    raise AssertionError("unreachable")
+            n += 1
+            folder = parent / f"{stamp}-{n}"
 
 
 def read_config(folder: Path) -> Config:

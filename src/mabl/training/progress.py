@@ -15,7 +15,7 @@ from mabl.runs.metrics import Row
 LINE_EVERY = 15.0
 """Seconds between lines where there is no terminal."""
 SPEED_OVER = 20
-"""Cycles over which the speed is measured: compiling and pretraining soon do not count."""
+"""Cycles over which the speed is measured: compiling and pretraining soon drop out."""
 EPISODES = 100
 """Returns and scores are means over at least this many of the newest episodes."""
 

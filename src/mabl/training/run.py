@@ -73,8 +73,7 @@ def resume(
             f"{path} has already done {checkpoints.latest} of {config.total_steps} steps: "
             "give a larger --total-steps"
         )
-    check_fits(training, 1, console)
-    shape = jax.eval_shape(training.init, jax.random.key(0))
+    shape = check_fits(training, 1, console)
     state = checkpoints.restore("state", shape)
     folder.write_config(path, config)
     return _run(
@@ -87,8 +86,11 @@ def resume(
     )
 
 
-def check_fits(training: Training, num_seeds: int, console: Console) -> None:
-    """Say how much memory a run takes. Raises UserError if its replay does not fit."""
+def check_fits(training: Training, num_seeds: int, console: Console) -> TrainState:
+    """Say how much memory a run takes; shapes of a seed's state.
+
+    Raises UserError if the replay does not fit.
+    """
     config = training.algorithm.config
     shape = jax.eval_shape(training.init, jax.random.key(0))
     replay, learner = num_seeds * tree_bytes(shape.replay), num_seeds * tree_bytes(shape.learner)
@@ -98,6 +100,7 @@ def check_fits(training: Training, num_seeds: int, console: Console) -> None:
         highlight=False,
     )
     check_memory(replay, free_memory())
+    return shape
 
 
 def build(config: Config) -> Training:
@@ -136,7 +139,7 @@ def _run(
         while step < total_steps and not interruption.requested:
             before, cycle_began = step, time.monotonic()
             n_model, n_policy = updates_due(states, config)
-            if n_model and not n_policy:
+            if n_model and int(states.model_updates[0]) < config.training.pretrain_updates:
                 console.print(f"pretraining the model: {n_model} updates ...", highlight=False)
             states, metrics = program(states, n_model, n_policy)
             step = int(states.env_steps.min())

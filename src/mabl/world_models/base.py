@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, Float
 
 from mabl.envs.base import ActionSpace, Discrete
-from mabl.errors import require_between, require_positive
+from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.kl import balanced_kl, categorical_kl
 from mabl.types import Metrics, PRNGKey, TimeStep
 from mabl.world_models.heads import Predictions
@@ -35,7 +35,7 @@ class WorldModelConfig:
     agent_prior_input: Literal["prior", "posterior"] = "prior"
     """Global sample behind the agent prior in training (sec. 3.2: prior, app. A: posterior)."""
     obs_weight: float = 1.0
-    """Weight of the observations' loss: 1 / variance of their likelihood."""
+    """Weight of the observations' loss."""
     reward_input: Literal["agent", "both"] = "agent"
     """What imagination's reward predictor sees: (z_agent, h_agent) as in the paper, or both levels;
     then the agent's own predictor is trained beside it."""
@@ -72,6 +72,11 @@ class WorldModelConfig:
         require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
         require_between(self, 0, inf, "free_nats", "obs_weight", "overshooting")
         require_between(self, 0, inf, "reward_weight", "agent_reward_weight")
+        if self.overshooting and self.agent_prior_input == "posterior":
+            raise UserError(
+                "--world-model.overshooting decodes what imagination would draw: give it 0, or "
+                "--world-model.agent-prior-input prior"
+            )
 
 
 class WorldModel(Protocol[L]):
@@ -141,7 +146,7 @@ def model_loss(
 
     `rows` are `[B, T, ...]`. Losses are sums over features and means over B, T and N. With
     `config.overshooting` the decoders also see the latent that the prior predicts for each row from
-    the row before: what imagination decodes, which the KL alone would train.
+    the row before (at a first row, from nothing): what imagination decodes and the KL alone trains.
     """
     batch, length = rows.is_first.shape
     key_observe, key_prior = jax.random.split(key)

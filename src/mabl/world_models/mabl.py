@@ -150,7 +150,7 @@ class MABL(eqx.Module):
     ) -> tuple[Latent, dict[str, Float[Array, "K C"]]]:
         """One agent's transition model: a sample and its logits.
 
-        The agent's prior is given the global sample, or `z_global`.
+        The agent's prior sees `z_global` if given, else the global sample.
         """
         key_agent, key_global = jax.random.split(key)
         global_logits = self.global_prior(h_global)
