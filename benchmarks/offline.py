@@ -42,7 +42,7 @@ def overridden(config: Config, settings: list[str]) -> Config:
         *groups, name = path.split(".")
         inner = data
         for group in groups:
-            inner = inner[group]
+            inner = inner.setdefault(group, {})
         inner[name] = yaml.safe_load(value)
     return from_dict(Config, data)
 
