@@ -26,7 +26,7 @@ PAPER_MODEL_LEARNING_RATE = {"smax/3s_vs_5z": 5e-4}
 QUICK = {
     "smax": Config(
         preset="quick",
-        total_steps=75_000,
+        total_steps=60_000,
         training=TrainingConfig(
             num_envs=16,
             collect_steps=16,
@@ -39,13 +39,13 @@ QUICK = {
         ),
         world_model=WorldModelConfig(
             hidden=128,
-            n_categoricals=8,
-            n_classes=8,
-            obs_weight=4.0,
+            n_categoricals=16,
+            n_classes=16,
+            obs_weight=16.0,
             reward_input="both",
             reward_loss="mse",
             kl_reduction="sum",
-            kl_weight=0.1,
+            kl_weight=0.03,
             overshooting=1.0,
             learning_rate=1e-3,
             batch_size=16,
@@ -56,7 +56,7 @@ QUICK = {
             actor_learning_rate=5e-4,
             critic_learning_rate=1e-3,
             ent_coef=0.02,
-            n_starts=128,
+            horizon=6,
             sample_availability=False,
         ),
     ),
