@@ -101,7 +101,14 @@ class ModelBased(NamedTuple):
             ),
             out_axes=1,
         )(start, available, weight, jax.random.split(key_imagine, weight.shape[0]))
-        behaviour, metrics = mappo.update(learner.behaviour, trajectory, key_ppo, config)
+        replayed = None
+        if config.replay_value_coef:
+            features = jax.vmap(jax.vmap(learner.model.critic_features))(latents)
+            features, rows = jax.tree.map(
+                lambda x: rearrange(x, "b t ... -> t b ..."), (features, rows)
+            )
+            replayed = mappo.replayed_values(learner.behaviour.critic, features, rows, config)
+        behaviour, metrics = mappo.update(learner.behaviour, trajectory, key_ppo, config, replayed)
         return learner._replace(behaviour=behaviour), metrics
 
     def diagnose(self, learner: Learner, replay: Replay, key: PRNGKey) -> Metrics:

@@ -26,7 +26,7 @@ PAPER_MODEL_LEARNING_RATE = {"smax/3s_vs_5z": 5e-4}
 QUICK = {
     "smax": Config(
         preset="quick",
-        total_steps=60_000,
+        total_steps=40_000,
         training=TrainingConfig(
             num_envs=16,
             collect_steps=16,
@@ -56,6 +56,7 @@ QUICK = {
             actor_learning_rate=5e-4,
             critic_learning_rate=1e-3,
             ent_coef=0.02,
+            replay_value_coef=1.0,
             horizon=6,
             sample_availability=False,
         ),

@@ -16,7 +16,7 @@ from mabl.behaviour.critic import Critic
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.ppo import clipped_surrogate
 from mabl.losses.returns import lambda_returns
-from mabl.types import Metrics, PRNGKey, Trajectory
+from mabl.types import Metrics, PRNGKey, TimeStep, Trajectory
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class MAPPOConfig:
     """Factor on the entropy bonus after every minibatch."""
     value_coef: float = 0.5
     """Factor on the critic's squared error."""
+    replay_value_coef: float = 0.0
+    """Weight, relative, of the critic's error on replayed sequences (ADR 8); 0 in the paper."""
     normalise_advantage: bool = True
     """Give advantages zero mean and unit variance over the imagined rows."""
     team_reward: bool = True
@@ -75,6 +77,7 @@ class MAPPOConfig:
         require_positive(self, "actor_learning_rate", "critic_learning_rate", "grad_clip", "clip")
         require_between(self, 0, 1, "gamma", "gae_lambda", "ent_decay")
         require_between(self, 0, inf, "actor_weight_decay", "ent_coef", "value_coef")
+        require_between(self, 0, inf, "replay_value_coef")
         require_between(self, 2, inf, "horizon")
         if self.hidden % self.n_heads:
             raise UserError(
@@ -101,6 +104,14 @@ class PPORows(NamedTuple):
     action: Array
     log_prob: Array
     advantage: Array
+    target: Array
+    weight: Array
+
+
+class ValueRows(NamedTuple):
+    """Joint rows of real experience, `[M, N, ...]`: what the critic alone learns from."""
+
+    critic_features: Array
     target: Array
     weight: Array
 
@@ -141,9 +152,7 @@ def experience(
     critic: Critic, trajectory: Trajectory, config: MAPPOConfig
 ) -> tuple[PPORows, Metrics]:
     """Lambda-returns and advantages of trajectories, flattened to joint rows."""
-    reward, weight = trajectory.reward, trajectory.weight
-    if config.team_reward:
-        reward = jnp.broadcast_to(reward.mean(-1, keepdims=True), reward.shape)
+    weight, reward = trajectory.weight, shared(trajectory.reward, config)
     value = jax.vmap(jax.vmap(critic))(trajectory.critic_features)
     target = lambda_returns(
         reward, config.gamma * trajectory.continues, value[1:], config.gae_lambda
@@ -174,6 +183,33 @@ def experience(
     return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
 
 
+def shared(reward: Float[Array, "*b N"], config: MAPPOConfig) -> Float[Array, "*b N"]:
+    """The team's mean reward for every agent, where `config.team_reward` says so."""
+    if not config.team_reward:
+        return reward
+    return jnp.broadcast_to(reward.mean(-1, keepdims=True), reward.shape)
+
+
+def replayed_values(
+    critic: Critic, features: Float[Array, "T B N G"], rows: TimeStep, config: MAPPOConfig
+) -> ValueRows:
+    """Lambda-returns along real sequences `[T, B, ...]`, whoever acted in them.
+
+    From an episode's last row to the next reset nothing passes: that step weighs nothing and hands
+    back the last row's value, so that truncated episodes bootstrap.
+    """
+    value = jax.vmap(jax.vmap(critic))(features)
+    ends = rows.is_first[1:, :, None]
+    target = lambda_returns(
+        jnp.where(ends, value[:-1], shared(rows.reward[1:], config)),
+        config.gamma * (1.0 - (rows.terminated[1:] | ends)),
+        value[1:],
+        config.gae_lambda,
+    )
+    real = ValueRows(features[:-1], target, jnp.broadcast_to(1.0 - ends, target.shape))
+    return jax.tree.map(lambda x: rearrange(x, "t b ... -> (t b) ..."), real)
+
+
 def actor_loss(
     actor: Actor, rows: PPORows, ent_coef: Float[Array, ""], clip: float
 ) -> tuple[Float[Array, ""], Metrics]:
@@ -198,7 +234,7 @@ def actor_loss(
 
 
 def critic_loss(
-    critic: Critic, rows: PPORows, value_coef: float
+    critic: Critic, rows: PPORows | ValueRows, value_coef: float
 ) -> tuple[Float[Array, ""], Metrics]:
     """`value_coef` times the squared error to the lambda-returns."""
     error = jax.vmap(critic)(rows.critic_features) - rows.target
@@ -211,21 +247,32 @@ def update(
     trajectory: Trajectory,
     key: PRNGKey,
     config: MAPPOConfig,
+    replayed: ValueRows | None = None,
 ) -> tuple[MAPPO, Metrics]:
-    """`n_epochs` of minibatch PPO on one set of trajectories (Algorithm 1, lines 12-13)."""
+    """`n_epochs` of minibatch PPO on one set of trajectories (Algorithm 1, lines 12-13).
+
+    The critic learns from `replayed` rows too, all of them in every minibatch, if there are any.
+    """
     rows, metrics = experience(mappo.critic, trajectory, config)
     n_rows = rows.target.shape[0]
     batch_size = min(config.batch_size, n_rows)
     n_batches = n_rows // batch_size
     actor_optimiser, critic_optimiser = optimisers(config)
 
+    def critic_losses(critic: Critic, batch: PPORows) -> tuple[Float[Array, ""], Metrics]:
+        loss, metrics = critic_loss(critic, batch, config.value_coef)
+        if replayed is not None:
+            real, _ = critic_loss(critic, replayed, config.replay_value_coef * config.value_coef)
+            loss, metrics = loss + real, metrics | {"behaviour/replay_critic_loss": real}
+        return loss, metrics
+
     def minibatch(mappo: MAPPO, index: Array) -> tuple[MAPPO, Metrics]:
         batch = jax.tree.map(lambda x: x[index], rows)
         actor_grad, actor_metrics = eqx.filter_grad(actor_loss, has_aux=True)(
             mappo.actor, batch, mappo.ent_coef, config.clip
         )
-        critic_grad, critic_metrics = eqx.filter_grad(critic_loss, has_aux=True)(
-            mappo.critic, batch, config.value_coef
+        critic_grad, critic_metrics = eqx.filter_grad(critic_losses, has_aux=True)(
+            mappo.critic, batch
         )
         actor_step, actor_opt = actor_optimiser.update(actor_grad, mappo.actor_opt, mappo.actor)  # pyright: ignore[reportArgumentType]
         critic_step, critic_opt = critic_optimiser.update(critic_grad, mappo.critic_opt)
