@@ -81,6 +81,11 @@ def test_sampling_follows_the_probabilities():
 # --- experience -------------------------------------------------------------------------------
 
 
+def reset_row():
+    """A row of a team of two, for its shapes."""
+    return CoordinationEnv().reset(jax.random.key(0))[1]
+
+
 class ConstantCritic(NamedTuple):
     value: float
 
@@ -131,6 +136,32 @@ def test_without_team_reward_every_agent_keeps_its_own():
     rows, _ = experience(replace(BY_HAND, team_reward=False), two_steps())
     # G_1 = 2.25 for both; G_0 = 1 or 3 + 0.25 * 2.125 = 0.53125
     assert_allclose(rows.target, [[1.53125, 3.53125], [2.25, 2.25]])
+
+
+@pytest.mark.parametrize(
+    ("terminated", "targets"),
+    # Team rewards 2 and 6, values 2. The last step, to the next reset, hands back 2.
+    # Terminated: G_1 = 6, G_0 = 2 + 0.5 (0.5 * 2 + 0.5 * 6) = 4
+    # Truncated: G_1 = 6 + 0.5 (0.5 * 2 + 0.5 * 2) = 7, G_0 = 2 + 0.5 (0.5 * 2 + 0.5 * 7) = 4.25
+    [(True, [4, 6, 2]), (False, [4.25, 7, 2])],
+)
+def test_replayed_values_by_hand(terminated, targets):
+    first = jnp.array([True, False, False, True])[:, None]
+    blank = jax.tree.map(lambda x: jnp.zeros((4, 1, *x.shape), x.dtype), reset_row())
+    rows = blank._replace(
+        is_first=first,
+        reward=jnp.array([[0.0, 0.0], [1.0, 3.0], [6.0, 6.0], [9.0, 9.0]])[:, None],
+        terminated=jnp.zeros((4, 1, 2), bool).at[2].set(terminated),
+        truncated=jnp.zeros((4, 1), bool).at[2].set(not terminated),
+    )
+    features = jnp.broadcast_to(jnp.arange(4.0)[:, None, None, None], (4, 1, 2, 7))
+    critic = ConstantCritic(2.0)
+    real = mappo.replayed_values(critic, features, rows, BY_HAND)  # pyright: ignore[reportArgumentType]
+    assert_allclose(real.target, [[target] * 2 for target in targets])
+    assert_array_equal(real.weight, [[1, 1], [1, 1], [0, 0]])
+    assert_array_equal(real.critic_features[:, 0, 0], [0, 1, 2])
+    alone = mappo.replayed_values(critic, features, rows, replace(BY_HAND, team_reward=False))  # pyright: ignore[reportArgumentType]
+    assert_allclose(alone.target[0], np.asarray(real.target[0]) + [-1, 1])
 
 
 def test_normalised_advantages_by_hand():
@@ -248,6 +279,23 @@ def test_the_entropy_bonus_alone_makes_the_policy_more_uniform(fresh):
     assert entropy(moved) > entropy(fresh.actor)
 
 
+def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fresh):
+    trajectory = random_trajectory(3, 4)
+    real = mappo.ValueRows(jnp.ones((6, 2, 7)), jnp.full((6, 2), 9.0), jnp.ones((6, 2)))
+
+    def updated(coef, replayed):
+        config = replace(TINY, replay_value_coef=coef)
+        return mappo.update(fresh, trajectory, jax.random.key(0), config, replayed)
+
+    (plain, _), (taught, metrics), (deaf, _) = updated(0, None), updated(1, real), updated(0, real)
+    assert same(plain.actor, taught.actor)
+    assert same(plain.critic, deaf.critic)
+    assert (taught.critic(real.critic_features[0]) > plain.critic(real.critic_features[0])).all()
+    assert metrics["behaviour/replay_critic_loss"] > 10  # 0.5 (9 - about 0)^2, falling
+    nothing = real._replace(weight=jnp.zeros((6, 2)))
+    assert same(plain.critic, updated(1, nothing)[0].critic)
+
+
 # --- with a real world model ------------------------------------------------------------------
 
 
@@ -344,13 +392,18 @@ def test_imagined_actions_were_available(imagined):
     assert (np.asarray(trajectory.available[0]) == [True, True, True, False]).all()
 
 
-def test_updating_the_policy_leaves_the_world_model_alone(coordination):
+@pytest.mark.parametrize("replay_value_coef", [0.0, 1.0])
+def test_updating_the_policy_leaves_the_world_model_alone(coordination, replay_value_coef):
     algorithm, learner, replay = coordination
+    config = algorithm.config
+    behaviour = replace(config.mappo, replay_value_coef=replay_value_coef)
+    algorithm = algorithm._replace(config=replace(config, mappo=behaviour))
     after, metrics = eqx.filter_jit(algorithm.update_policy)(learner, replay, jax.random.key(0))
     assert same((learner.model, learner.model_opt), (after.model, after.model_opt))
     assert not same(learner.behaviour.actor, after.behaviour.actor)
     assert not same(learner.behaviour.critic, after.behaviour.critic)
     assert all(np.isfinite(v) for v in metrics.values())
+    assert ("behaviour/replay_critic_loss" in metrics) == (replay_value_coef > 0)
 
 
 def test_updating_the_model_leaves_actor_and_critic_alone(coordination):
