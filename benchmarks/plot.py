@@ -3,15 +3,17 @@
     uv run python -m benchmarks.plot --runs 'MABL=runs/smax/3m/mabl/*/*' \\
         --ppo MAPPO=ppo.json --out 3m.png
 
-The win rate at a step is that of the training episodes in the window of steps before it.
+Win rate and return at a step are those of the training episodes in the window of steps before it.
 """
 
 import argparse
 import json
 from glob import glob
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mabl.runs.metrics import read
@@ -20,30 +22,48 @@ WINDOW = 4_000
 """Environment steps over which training episodes are averaged."""
 
 
-def run_curve(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Steps, episodes and wins of each cycle of a run."""
+class Curve(NamedTuple):
+    """What ended in each cycle of a run: `[cycles]`."""
+
+    steps: np.ndarray
+    episodes: np.ndarray
+    wins: np.ndarray
+    returns: np.ndarray
+
+
+def run_curve(folder: Path) -> Curve:
+    """The cycles of a run."""
     rows = [row for row in read(folder) if row["train/episodes"]]
-    steps = np.array([row["step"] for row in rows])
-    episodes = np.array([row["train/episodes"] for row in rows])
-    wins = episodes * np.array([row["train/win_rate"] for row in rows])
-    return steps, episodes, wins
+    steps, episodes, win_rate, episode_return = (
+        np.array([row[name] for row in rows])
+        for name in ("step", "train/episodes", "train/win_rate", "train/episode_return")
+    )
+    return Curve(steps, episodes, episodes * win_rate, episodes * episode_return)
 
 
-def ppo_curve(curve: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of a seed of benchmarks/ppo.py."""
-    return np.cumsum(curve["steps"]), np.array(curve["episodes"]), np.array(curve["wins"])
+def ppo_curve(curve: dict) -> Curve:
+    """The batches of a seed of benchmarks/ppo.py."""
+    steps, *sums = (np.array(curve[name]) for name in ("steps", "episodes", "wins", "returns"))
+    return Curve(np.cumsum(steps), *sums)
 
 
-def win_rate(curve: tuple[np.ndarray, np.ndarray, np.ndarray], grid: np.ndarray) -> np.ndarray:
-    """Wins over episodes in the window before each point of the grid; NaN without episodes."""
-    steps, episodes, wins = curve
-    rates = []
+def per_episode(curve: Curve, sums: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Sums over episodes in the window before each point of the grid; NaN without episodes."""
+    means = []
     for end in grid:
-        inside = (steps > end - WINDOW) & (steps <= end)
-        total = episodes[inside].sum()
-        seen = total and end < steps[-1] + 1_000
-        rates.append(wins[inside].sum() / total if seen else np.nan)
-    return np.array(rates)
+        inside = (curve.steps > end - WINDOW) & (curve.steps <= end)
+        total = curve.episodes[inside].sum()
+        seen = total and end < curve.steps[-1] + 1_000
+        means.append(sums[inside].sum() / total if seen else np.nan)
+    return np.array(means)
+
+
+def draw(axis: Axes, grid: np.ndarray, label: str, means: np.ndarray) -> None:
+    """The mean over seeds `[S, grid]`, shaded from the lowest to the highest."""
+    shown = ~np.isnan(means).any(0)
+    (line,) = axis.plot(grid[shown], means[:, shown].mean(0), label=f"{label} ({len(means)})")
+    low, high = means[:, shown].min(0), means[:, shown].max(0)
+    axis.fill_between(grid[shown], low, high, color=line.get_color(), alpha=0.2)
 
 
 def main() -> None:
@@ -62,28 +82,23 @@ def main() -> None:
         curves = json.loads(Path(path).read_text())["curves"]
         groups[label] = [ppo_curve(curve) for curve in curves.values()]
 
-    longest = max(curve[0][-1] for curves in groups.values() for curve in curves)
+    longest = max(curve.steps[-1] for curves in groups.values() for curve in curves)
     grid = np.arange(1_000, longest + 1, 1_000)
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
-    axis = figure.subplots()
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    won, earned = figure.subplots(1, 2)
     for label, curves in groups.items():
-        rates = np.stack([win_rate(curve, grid) for curve in curves])
-        shown = ~np.isnan(rates).any(0)
-        (line,) = axis.plot(grid[shown], rates[:, shown].mean(0), label=f"{label} ({len(rates)})")
-        axis.fill_between(
-            grid[shown],
-            rates[:, shown].min(0),
-            rates[:, shown].max(0),
-            color=line.get_color(),
-            alpha=0.2,
-        )
+        rates = np.stack([per_episode(curve, curve.wins, grid) for curve in curves])
+        draw(won, grid, label, rates)
+        draw(earned, grid, label, np.stack([per_episode(c, c.returns, grid) for c in curves]))
         at_20k = [float(rate[19]) for rate in rates if len(rate) > 19]
         print(label, "win rate at 20k steps:", [round(rate, 3) for rate in at_20k])
-    axis.set(
-        title=args.title, xlabel="environment steps", ylabel="win rate in training", ylim=(0, 1)
-    )
-    axis.grid(alpha=0.3)
-    axis.legend(frameon=False)
+    won.set(ylabel="win rate in training", ylim=(0, 1))
+    earned.set(ylabel="episode return in training", ylim=(0, None))
+    for axis in (won, earned):
+        axis.set(xlabel="environment steps")
+        axis.grid(alpha=0.3)
+    won.legend(frameon=False)
+    figure.suptitle(args.title)
     figure.savefig(args.out, dpi=130)
 
 
