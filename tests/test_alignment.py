@@ -83,7 +83,7 @@ def drawn():
             steps.append(steps_in(collected))
         rows = sample_sequences(replay, jax.random.key(1), 32, LENGTH)
         latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
-            Witness(),  # pyright: ignore[reportArgumentType]
+            Witness(),
             rows,
             jax.random.split(jax.random.key(2), 32),
         )
@@ -211,8 +211,8 @@ def test_imagined_fields_are_aligned_as_trajectory_documents(horizon):
     # At the start the real availability counts, here action 1 alone, whatever the model says.
     available = jnp.broadcast_to(jnp.array([False, True, False]), (2, 3))
     trajectory = imagine_trajectory(
-        Clockwork(),  # pyright: ignore[reportArgumentType]
-        lambda features, available: MaskedCategorical.of(jnp.zeros(3), available),  # pyright: ignore
+        Clockwork(),
+        lambda features, available: MaskedCategorical.of(jnp.zeros(3), available),
         start,
         available,
         jnp.float32(0.5),
@@ -243,8 +243,8 @@ def test_imagined_fields_are_aligned_as_trajectory_documents(horizon):
 def test_no_gradient_flows_through_imagination():
     def total(scale):
         trajectory = imagine_trajectory(
-            Clockwork(),  # pyright: ignore[reportArgumentType]
-            lambda features, available: MaskedCategorical.of(scale * jnp.arange(3.0), available),  # pyright: ignore
+            Clockwork(),
+            lambda features, available: MaskedCategorical.of(scale * jnp.arange(3.0), available),
             Counter(jnp.array([10, 10]), jnp.array([0, 0])),
             jnp.ones((2, 3), bool),
             jnp.float32(1.0),
@@ -267,8 +267,8 @@ class Doubtful(Clockwork):
 @pytest.mark.parametrize(("sample", "share"), [(True, 0.6), (False, 1.0)])
 def test_imagined_availability_is_a_sample_or_the_mode(sample, share):
     trajectory = imagine_trajectory(
-        Doubtful(),  # pyright: ignore[reportArgumentType]
-        lambda features, available: MaskedCategorical.of(jnp.zeros(3), available),  # pyright: ignore
+        Doubtful(),
+        lambda features, available: MaskedCategorical.of(jnp.zeros(3), available),
         Counter(jnp.array([0, 0]), jnp.array([0, 0])),
         jnp.ones((2, 3), bool),
         jnp.float32(1.0),

@@ -1,5 +1,6 @@
 """The command line, as a person meets it: one line for a mistake, and runs that go on."""
 
+import errno
 import json
 import os
 import shutil
@@ -61,6 +62,7 @@ def rows_of(folder):
 MISTAKES = {
     "environment": (["train", "--env", "smax/3n"], "unknown environment 'smax/3n': did you mean"),
     "family": (["train", "--env", "smac/3m"], "unknown environment 'smac/3m'"),
+    "task": (["train", "--env", "3m"], "unknown environment '3m': did you mean smax/3m?"),
     "algorithm": (["train", "--algo", "mable"], "unknown algorithm 'mable': did you mean mabl?"),
     "preset": (["train", "--preset", "quik"], "unknown preset 'quik': did you mean quick?"),
     "command": (["trian"], "unknown command 'trian': did you mean train?"),
@@ -68,6 +70,11 @@ MISTAKES = {
     "zero": (["train", "--total-steps", "0"], "--total-steps is 0: give a number above 0"),
     "negative": (["train", "--training.model-updates=-1"], "--training.model-updates is -1"),
     "capacity": (["train", "--training.replay-capacity=16"], "--training.replay-capacity 16"),
+    "sequence": (
+        ["train", "--world-model.batch-length=1"],
+        "--world-model.batch-length is 1: give a number from 2",
+    ),
+    "infinite": (["train", "--mappo.clip=inf"], "--mappo.clip is inf: give a number above 0"),
     "heads": (["train", "--mappo.hidden=30"], "--mappo.hidden is 30: give a multiple of its 8"),
     "overshooting": (
         [
@@ -110,6 +117,26 @@ def test_a_logdir_that_cannot_be_written_is_named(mabl, tmp_path):
     (tmp_path / "file").write_text("in the way")
     code, _, err = mabl("train", *TINY, f"--logdir={tmp_path}/file")
     assert code == 2 and "cannot write to" in err and "choose another --logdir" in err
+
+
+@pytest.mark.parametrize("reason", [errno.EACCES, errno.EROFS, errno.ENOSPC])
+def test_a_run_folder_that_cannot_be_written_is_one_line(trained, mabl, monkeypatch, reason):
+    def refuse(path, config):
+        raise OSError(reason, os.strerror(reason), str(path))
+
+    monkeypatch.setattr(run_folder, "write_config", refuse)
+    code, _, err = mabl("resume", trained, "--total-steps=900")
+    assert code == 2
+    assert err.endswith(f"mabl: {os.strerror(reason)} ({trained}): give mabl a place to write\n")
+    assert "Traceback" not in err
+
+
+def test_a_run_that_diverges_stops_before_it_spoils_its_checkpoints(mabl, tmp_path):
+    rate = "--mappo.critic-learning-rate=1e38"
+    code, _, err = mabl("train", *TINY, "--total-steps=600", rate, f"--logdir={tmp_path}")
+    assert code == 2 and "training diverged before step" in err
+    assert "(behaviour.critic." in err and "none was kept: lower the learning rates" in err
+    assert not any(path.name.isdigit() for path in tmp_path.rglob("checkpoints/*"))
 
 
 def test_a_replay_that_cannot_fit_is_refused_before_it_is_allocated(mabl, tmp_path):

@@ -3,14 +3,12 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from mabl import replay as replays
 from mabl.envs.counting import CountingEnv
-from mabl.errors import UserError
 from mabl.types import TimeStep
 
 CAPACITY, CHUNK, LENGTH, SAMPLES = 7, 4, 3, 1024
@@ -33,7 +31,7 @@ def tagged(ids: np.ndarray) -> TimeStep:
         alive=np.ones(wide.shape, bool),
         is_first=ids % 2 == 0,
         score=ids.astype(np.float32),
-    )  # pyright: ignore
+    )
 
 
 def ids_of(rows: TimeStep) -> np.ndarray:
@@ -148,10 +146,3 @@ def test_sequences_cross_episodes():
     )
     assert_array_equal(sequence.state[0, :, 0], [0, 1, 2, 0, 1, 2])
     assert_array_equal(sequence.is_first[0], [True, False, False] * 2)
-
-
-def test_too_little_memory_is_a_user_error_before_allocation():
-    replays.check_memory(100, None)
-    replays.check_memory(100, 100)
-    with pytest.raises(UserError, match=r"needs 3\.0 GiB and 1\.0 GiB are free: lower"):
-        replays.check_memory(3 * 2**30, 2**30)

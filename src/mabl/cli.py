@@ -1,5 +1,6 @@
 """The command line: train, resume, eval, envs, algos."""
 
+import errno
 import json
 import os
 import sys
@@ -17,6 +18,9 @@ from mabl.errors import UserError, unknown_name
 PIPED_WIDTH = 160
 """Columns of a table that goes to a file or another program."""
 
+UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC)
+"""A user's to mend: no permission, a file system for reading only, a full disk."""
+
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""
 
@@ -30,11 +34,14 @@ def main() -> None:
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-    except PermissionError as error:
-        print(f"mabl: no permission for {error.filename}: change it or copy it", file=sys.stderr)
-        sys.exit(2)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        if error.errno not in UNWRITABLE:
+            raise
+        where = f" ({error.filename})" if error.filename else ""
+        print(f"mabl: {error.strerror}{where}: give mabl a place to write", file=sys.stderr)
+        sys.exit(2)
 
 
 def run(arguments: list[str]) -> int:

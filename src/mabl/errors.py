@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from math import inf
 
 
 class UserError(Exception):
@@ -11,7 +12,10 @@ class UserError(Exception):
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The error for a name that a registry lacks, with the nearest names and all that exist."""
     names = sorted(known)
-    near = get_close_matches(name, names, n=3, cutoff=0.5)
+    task = name.rpartition("/")[2]
+    near = get_close_matches(name, names, n=3, cutoff=0.5) or [
+        known for known in names if known.endswith(f"/{task}")
+    ]
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     return UserError(f"unknown {kind} {name!r}: {hint}choose from {', '.join(names)}")
 
@@ -20,7 +24,7 @@ def require_positive(config: object, *names: str) -> None:
     """Raise UserError unless each named field of a config is None or above 0."""
     for name in names:
         value = getattr(config, name)
-        if value is not None and not value > 0:
+        if value is not None and not 0 < value < inf:
             raise _out_of_range(config, name, value, "a number above 0")
 
 

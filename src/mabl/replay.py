@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from mabl.errors import UserError
 from mabl.types import PRNGKey, TimeStep
 
 
@@ -58,12 +57,3 @@ def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int)
     oldest = (replay.cursor - replay.size)[lane]
     index = ((oldest + age)[:, None] + jnp.arange(length)[None]) % capacity
     return jax.tree.map(lambda x: x[lane[:, None], index], replay.rows)
-
-
-def check_memory(needed: int, free: int | None) -> None:
-    """Raise UserError if `needed` bytes exceed the `free` bytes (None: unknown, no check)."""
-    if free is not None and needed > free:
-        raise UserError(
-            f"the replay needs {needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: "
-            "lower --training.replay-capacity, --training.num-envs or --num-seeds"
-        )

@@ -113,7 +113,7 @@ BY_HAND = replace(TINY, gamma=0.5, gae_lambda=0.5, normalise_advantage=False)
 
 def experience(config: MAPPOConfig, trajectory: Trajectory):
     critic = ConstantCritic(2.0)
-    return mappo.experience(critic, trajectory, config)  # pyright: ignore[reportArgumentType]
+    return mappo.experience(critic, trajectory, config)
 
 
 def test_experience_by_hand():
@@ -138,30 +138,42 @@ def test_without_team_reward_every_agent_keeps_its_own():
     assert_allclose(rows.target, [[1.53125, 3.53125], [2.25, 2.25]])
 
 
+class RowCritic:
+    """Values that tell which row they are of: 1, 2, 4, 8."""
+
+    def __call__(self, features: Array) -> Array:
+        return 2.0 ** features[:, 0]
+
+
 @pytest.mark.parametrize(
-    ("terminated", "targets"),
-    # Team rewards 2 and 6, values 2. The last step, to the next reset, hands back 2.
+    ("end", "targets"),
+    # Team rewards on arriving at rows 1 to 3: 2, 6 and 9. G_2 is cut or bootstraps from value 8.
+    # None: G_2 = 9 + 0.5 * 8 = 13, G_1 = 6 + 0.5 (0.5 * 4 + 0.5 * 13) = 10.25,
+    #       G_0 = 2 + 0.5 (0.5 * 2 + 0.5 * 10.25) = 5.0625
+    # Row 3 is a reset: its step hands back the value of row 2, 4, which ended the episode.
     # Terminated: G_1 = 6, G_0 = 2 + 0.5 (0.5 * 2 + 0.5 * 6) = 4
-    # Truncated: G_1 = 6 + 0.5 (0.5 * 2 + 0.5 * 2) = 7, G_0 = 2 + 0.5 (0.5 * 2 + 0.5 * 7) = 4.25
-    [(True, [4, 6, 2]), (False, [4.25, 7, 2])],
+    # Truncated: G_1 = 6 + 0.5 (0.5 * 4 + 0.5 * 4) = 8, G_0 = 2 + 0.5 (0.5 * 2 + 0.5 * 8) = 4.5
+    [
+        (None, [5.0625, 10.25, 13]),
+        ("terminated", [4, 6, 4]),
+        ("truncated", [4.5, 8, 4]),
+    ],
 )
-def test_replayed_values_by_hand(terminated, targets):
-    first = jnp.array([True, False, False, True])[:, None]
-    blank = jax.tree.map(lambda x: jnp.zeros((4, 1, *x.shape), x.dtype), reset_row())
+def test_replayed_values_by_hand(end, targets):
+    blank = jax.tree.map(lambda x: jnp.zeros((4, *x.shape), x.dtype), reset_row())
     rows = blank._replace(
-        is_first=first,
-        reward=jnp.array([[0.0, 0.0], [1.0, 3.0], [6.0, 6.0], [9.0, 9.0]])[:, None],
-        terminated=jnp.zeros((4, 1, 2), bool).at[2].set(terminated),
-        truncated=jnp.zeros((4, 1), bool).at[2].set(not terminated),
+        is_first=jnp.array([True, False, False, end is not None]),
+        reward=jnp.array([[0.0, 0.0], [1.0, 3.0], [6.0, 6.0], [9.0, 9.0]]),
+        terminated=jnp.zeros((4, 2), bool).at[2].set(end == "terminated"),
+        truncated=jnp.zeros(4, bool).at[2].set(end == "truncated"),
     )
-    features = jnp.broadcast_to(jnp.arange(4.0)[:, None, None, None], (4, 1, 2, 7))
-    critic = ConstantCritic(2.0)
-    real = mappo.replayed_values(critic, features, rows, BY_HAND)  # pyright: ignore[reportArgumentType]
+    features = jnp.broadcast_to(jnp.arange(4.0)[:, None, None], (4, 2, 7))
+    real = mappo.replayed_values(RowCritic(), features, rows, BY_HAND)
     assert_allclose(real.target, [[target] * 2 for target in targets])
-    assert_array_equal(real.weight, [[1, 1], [1, 1], [0, 0]])
+    assert_array_equal(real.weight, [[1, 1], [1, 1], [end is None] * 2])
     assert_array_equal(real.critic_features[:, 0, 0], [0, 1, 2])
-    alone = mappo.replayed_values(critic, features, rows, replace(BY_HAND, team_reward=False))  # pyright: ignore[reportArgumentType]
-    assert_allclose(alone.target[0], np.asarray(real.target[0]) + [-1, 1])
+    alone = mappo.replayed_values(RowCritic(), features, rows, replace(BY_HAND, team_reward=False))
+    assert_allclose(alone.target[0], [targets[0] - 1, targets[0] + 1])
 
 
 def test_normalised_advantages_by_hand():

@@ -385,7 +385,7 @@ class Rigged(eqx.Module):
 
 def rigged_loss(rows: TimeStep, space=SPEC.action_space, **options) -> dict[str, float]:
     config = replace(CONFIG, **options)
-    _, metrics = model_loss(Rigged(3), rows, jax.random.key(0), config, space)  # pyright: ignore
+    _, metrics = model_loss(Rigged(3), rows, jax.random.key(0), config, space)
     return {k.removeprefix("world_model/loss_"): float(v) for k, v in metrics.items()}
 
 

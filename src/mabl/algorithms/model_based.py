@@ -104,10 +104,12 @@ class ModelBased(NamedTuple):
         replayed = None
         if config.replay_value_coef:
             features = jax.vmap(jax.vmap(learner.model.critic_features))(latents)
-            features, rows = jax.tree.map(
-                lambda x: rearrange(x, "b t ... -> t b ..."), (features, rows)
-            )
-            replayed = mappo.replayed_values(learner.behaviour.critic, features, rows, config)
+            replayed = jax.vmap(
+                lambda features, rows: mappo.replayed_values(
+                    learner.behaviour.critic, features, rows, config
+                )
+            )(features, rows)
+            replayed = jax.tree.map(lambda x: rearrange(x, "b t ... -> (b t) ..."), replayed)
         behaviour, metrics = mappo.update(learner.behaviour, trajectory, key_ppo, config, replayed)
         return learner._replace(behaviour=behaviour), metrics
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from mabl.algorithms.config import Config, TrainingConfig
 from mabl.behaviour.mappo import MAPPOConfig
+from mabl.envs import registry
 from mabl.errors import unknown_name
 from mabl.world_models.base import WorldModelConfig
 
@@ -111,7 +112,7 @@ def preset(name: str, env: str, algo: str) -> Config:
     families = PRESETS[name]
     family = env.split("/")[0]
     if family not in families:
-        raise unknown_name("environment", env, (f"{family}/..." for family in families))
+        raise registry.unknown(env)
     config = replace(families[family], env=env, algo=algo)
     if name == "paper" and env in PAPER_MODEL_LEARNING_RATE:
         rate = PAPER_MODEL_LEARNING_RATE[env]

@@ -58,7 +58,8 @@ class MAPPOConfig:
     value_coef: float = 0.5
     """Factor on the critic's squared error."""
     replay_value_coef: float = 0.0
-    """Weight, relative, of the critic's error on replayed sequences (ADR 8); 0 in the paper."""
+    """Weight of the critic's error on replayed sequences beside that on imagined ones (ADR 8); 0 in
+    the paper."""
     normalise_advantage: bool = True
     """Give advantages zero mean and unit variance over the imagined rows."""
     team_reward: bool = True
@@ -109,7 +110,7 @@ class PPORows(NamedTuple):
 
 
 class ValueRows(NamedTuple):
-    """Joint rows of real experience, `[M, N, ...]`: what the critic alone learns from."""
+    """Joint rows of real experience, `[*b, N, ...]`: what the critic alone learns from."""
 
     critic_features: Array
     target: Array
@@ -152,7 +153,7 @@ def experience(
     critic: Critic, trajectory: Trajectory, config: MAPPOConfig
 ) -> tuple[PPORows, Metrics]:
     """Lambda-returns and advantages of trajectories, flattened to joint rows."""
-    weight, reward = trajectory.weight, shared(trajectory.reward, config)
+    weight, reward = trajectory.weight, shared_reward(trajectory.reward, config)
     value = jax.vmap(jax.vmap(critic))(trajectory.critic_features)
     target = lambda_returns(
         reward, config.gamma * trajectory.continues, value[1:], config.gae_lambda
@@ -183,7 +184,7 @@ def experience(
     return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
 
 
-def shared(reward: Float[Array, "*b N"], config: MAPPOConfig) -> Float[Array, "*b N"]:
+def shared_reward(reward: Float[Array, "*b N"], config: MAPPOConfig) -> Float[Array, "*b N"]:
     """The team's mean reward for every agent, where `config.team_reward` says so."""
     if not config.team_reward:
         return reward
@@ -191,23 +192,22 @@ def shared(reward: Float[Array, "*b N"], config: MAPPOConfig) -> Float[Array, "*
 
 
 def replayed_values(
-    critic: Critic, features: Float[Array, "T B N G"], rows: TimeStep, config: MAPPOConfig
+    critic: Critic, features: Float[Array, "T N G"], rows: TimeStep, config: MAPPOConfig
 ) -> ValueRows:
-    """Lambda-returns along real sequences `[T, B, ...]`, whoever acted in them.
+    """Lambda-returns along one real sequence `[T, ...]`, whoever acted in it (ADR 8).
 
     From an episode's last row to the next reset nothing passes: that step weighs nothing and hands
     back the last row's value, so that truncated episodes bootstrap.
     """
-    value = jax.vmap(jax.vmap(critic))(features)
-    ends = rows.is_first[1:, :, None]
+    value = jax.vmap(critic)(features)
+    ends = rows.is_first[1:, None]
     target = lambda_returns(
-        jnp.where(ends, value[:-1], shared(rows.reward[1:], config)),
+        jnp.where(ends, value[:-1], shared_reward(rows.reward[1:], config)),
         config.gamma * (1.0 - (rows.terminated[1:] | ends)),
         value[1:],
         config.gae_lambda,
     )
-    real = ValueRows(features[:-1], target, jnp.broadcast_to(1.0 - ends, target.shape))
-    return jax.tree.map(lambda x: rearrange(x, "t b ... -> (t b) ..."), real)
+    return ValueRows(features[:-1], target, jnp.broadcast_to(1.0 - ends, target.shape))
 
 
 def actor_loss(
@@ -259,7 +259,7 @@ def update(
     n_batches = n_rows // batch_size
     actor_optimiser, critic_optimiser = optimisers(config)
 
-    def critic_losses(critic: Critic, batch: PPORows) -> tuple[Float[Array, ""], Metrics]:
+    def critic_objective(critic: Critic, batch: PPORows) -> tuple[Float[Array, ""], Metrics]:
         loss, metrics = critic_loss(critic, batch, config.value_coef)
         if replayed is not None:
             real, _ = critic_loss(critic, replayed, config.replay_value_coef * config.value_coef)
@@ -271,7 +271,7 @@ def update(
         actor_grad, actor_metrics = eqx.filter_grad(actor_loss, has_aux=True)(
             mappo.actor, batch, mappo.ent_coef, config.clip
         )
-        critic_grad, critic_metrics = eqx.filter_grad(critic_losses, has_aux=True)(
+        critic_grad, critic_metrics = eqx.filter_grad(critic_objective, has_aux=True)(
             mappo.critic, batch
         )
         actor_step, actor_opt = actor_optimiser.update(actor_grad, mappo.actor_opt, mappo.actor)  # pyright: ignore[reportArgumentType]

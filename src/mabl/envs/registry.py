@@ -8,7 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 from mabl.envs.base import CompiledEnv
-from mabl.errors import unknown_name
+from mabl.errors import UserError, unknown_name
 
 
 class Entry(NamedTuple):
@@ -80,8 +80,13 @@ def make(name: str) -> CompiledEnv:
     """The environment of that name, e.g. `smax/3s_vs_4z`; `UserError` if there is none."""
     entries = FAMILIES.get(name.partition("/")[0], dict)()
     if name not in entries:
-        raise unknown_name("environment", name, _entries())
+        raise unknown(name)
     return entries[name].make()
+
+
+def unknown(name: str) -> UserError:
+    """The error for an environment that does not exist."""
+    return unknown_name("environment", name, _entries())
 
 
 def names() -> list[EnvRow]:

@@ -1,4 +1,4 @@
-"""Lambda-returns along imagined or real trajectories."""
+"""Lambda-returns along imagined or real trajectories (section 3.3)."""
 
 import jax
 from jaxtyping import Array, Float

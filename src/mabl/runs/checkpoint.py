@@ -1,6 +1,6 @@
 """Checkpoints: all that decides a run's future, written atomically with Orbax, the last K kept.
 
-Each holds two items: `policy` (what acting needs: filter and actor) and `state` (all the rest).
+Each holds two items: `policy` (what acting needs: filter and actor) and `state` (everything).
 Arrays are stored under readable names in flat dictionaries; nothing is pickled.
 """
 
@@ -61,9 +61,10 @@ class Checkpoints:
         try:
             arrays = self._manager.restore(self.latest, args=args)[item]
         except (ValueError, KeyError, FileNotFoundError) as error:
+            reason = str(error).partition("\n")[0][:200]
             raise UserError(
                 f"checkpoint {self.folder}/{self.latest} does not fit this run's config "
-                f"({str(error).splitlines()[0][:200]}): evaluate it with the mabl that wrote it"
+                f"({reason}): evaluate it with the mabl that wrote it"
             ) from error
         return from_arrays(like, arrays)
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import jax
 
+from mabl.errors import UserError
+
 
 def tree_bytes(tree: Any) -> int:
     """Bytes of all arrays of a pytree (or of their shapes)."""
@@ -22,3 +24,12 @@ def free_memory() -> int | None:
         return None
     lines = dict(line.split(":") for line in meminfo.read_text().splitlines())
     return int(lines["MemAvailable"].split()[0]) * 1024
+
+
+def check_memory(needed: int, free: int | None) -> None:
+    """Raise UserError if `needed` bytes exceed the `free` bytes (None: unknown, no check)."""
+    if free is not None and needed > free:
+        raise UserError(
+            f"the replay needs {needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: "
+            "lower --training.replay-capacity, --training.num-envs or --num-seeds"
+        )

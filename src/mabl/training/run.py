@@ -2,7 +2,6 @@
 
 import signal
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -12,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 from rich.console import Console
 
 from mabl.algorithms import registry as algorithms
@@ -20,13 +20,12 @@ from mabl.algorithms.diagnostics import DIAGNOSED_ROWS
 from mabl.envs import registry as envs
 from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
-from mabl.replay import check_memory
 from mabl.runs import folder
-from mabl.runs.checkpoint import Checkpoints
+from mabl.runs.checkpoint import Checkpoints, named
 from mabl.runs.metrics import MetricsLog, Row, read
 from mabl.training import curves
 from mabl.training.loop import Training, TrainState
-from mabl.training.memory import free_memory, tree_bytes
+from mabl.training.memory import check_memory, free_memory, tree_bytes
 from mabl.training.progress import Progress, duration
 
 DIAGNOSE = 2**31 - 1
@@ -48,7 +47,7 @@ def train(config: Config, console: Console | None = None) -> Outcome:
     console = console or Console(stderr=True)
     training = build(config)
     seeds = range(config.seed, config.seed + config.num_seeds)
-    check_fits(training, config.num_seeds, console)
+    check_memory_of(training, config.num_seeds, console)
     folders = [folder.create(config, seed) for seed in seeds]
     for path in folders:
         console.print(f"run folder {path}", highlight=False, soft_wrap=True)
@@ -73,7 +72,7 @@ def resume(
             f"{path} has already done {checkpoints.latest} of {config.total_steps} steps: "
             "give a larger --total-steps"
         )
-    shape = check_fits(training, 1, console)
+    shape = check_memory_of(training, 1, console)
     state = checkpoints.restore("state", shape)
     folder.write_config(path, config)
     return _run(
@@ -86,7 +85,7 @@ def resume(
     )
 
 
-def check_fits(training: Training, num_seeds: int, console: Console) -> TrainState:
+def check_memory_of(training: Training, num_seeds: int, console: Console) -> TrainState:
     """Say how much memory a run takes; shapes of a seed's state.
 
     Raises UserError if the replay does not fit.
@@ -148,7 +147,7 @@ def _run(
             ):
                 metrics |= diagnose(states)
             metrics = jax.device_get(metrics)
-            check_finite(metrics, n_model, n_policy, step, checkpoints[0])
+            check_finite(states, step, checkpoints[0])
             seconds = time.monotonic() - cycle_began
             for k, log in enumerate(logs):
                 row = describe(
@@ -195,17 +194,22 @@ def longest_lane(states: TrainState) -> int:
     return int(states.replay.size.max(-1).min())
 
 
-def check_finite(
-    metrics: Mapping[str, np.ndarray], n_model: int, n_policy: int, step: int, last: Checkpoints
-) -> None:
+def check_finite(states: TrainState, step: int, last: Checkpoints) -> None:
     """Stop a run that diverged before it overwrites its good checkpoints."""
-    for updates, name in ((n_model, "world_model/loss"), (n_policy, "behaviour/actor_loss")):
-        if updates and not np.isfinite(metrics[name]).all():
-            kept = f"its checkpoint at {last.latest} steps is good" if last.any else "none was kept"
-            raise UserError(
-                f"training diverged before step {step} ({name} is not finite); {kept}: "
-                "lower the learning rates"
-            )
+    if all_finite(states.learner):
+        return
+    name = next(name for name, leaf in named(states.learner) if not np.isfinite(leaf).all())
+    kept = f"its checkpoint at {last.latest} steps is good" if last.any else "none was kept"
+    raise UserError(
+        f"training diverged before step {step} ({name} is not finite); {kept}: "
+        "lower the learning rates"
+    )
+
+
+@jax.jit
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Whether every number of a pytree is finite."""
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
 
 
 def crossed(before: int, now: int, every: int) -> bool:

@@ -64,11 +64,12 @@ class WorldModelConfig:
     batch_size: int = 40
     """Sequences in a model update."""
     batch_length: int = 20
-    """Rows of a sequence."""
+    """Rows of a sequence, 2 at least."""
 
     def __post_init__(self) -> None:
         require_positive(self, "hidden", "n_hidden", "n_categoricals", "n_classes", "batch_size")
-        require_positive(self, "batch_length", "learning_rate", "grad_clip")
+        require_positive(self, "learning_rate", "grad_clip")
+        require_between(self, 2, inf, "batch_length")
         require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
         require_between(self, 0, inf, "free_nats", "obs_weight", "overshooting")
         require_between(self, 0, inf, "reward_weight", "agent_reward_weight")
@@ -144,7 +145,9 @@ def model_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """L(psi) = L_ELBO + L_reward + L_termination + L_available + L_action (section 3.2).
 
-    `rows` are `[B, T, ...]`. Losses are sums over features and means over B, T and N. With
+    L_ELBO = -log p(o^i | h^a, z^a) + KL(q(z^a | .) || p(z^a | .)) + KL(q(z^g | .) || p(z^g | .)),
+    the KLs balanced (`losses/kl.py`); the other terms are those of `decoder_losses`. `rows` are
+    `[B, T, ...]`. Losses are sums over features and means over B, T and N. With
     `config.overshooting` the decoders also see the latent that the prior predicts for each row from
     the row before (at a first row, from nothing): what imagination decodes and the KL alone trains.
     """
@@ -188,6 +191,8 @@ def decoder_losses(
 ) -> dict[str, Float[Array, ""]]:
     """-log likelihoods of rows `[B, T, ...]` under what is decoded from their latents, weighted.
 
+    -log p(o^i | z^a, h^a), -log p(r^i | z^a, h^a), and -log p(. | z^a, z^g, h^a, h^g) of
+    termination, availability and the action a^i_{t-1} (sections 3.1.2 and 3.2).
     Observations and actions of dead agents do not count, nor does the action before a first row.
     """
     alive = rows.alive.astype(jnp.float32)

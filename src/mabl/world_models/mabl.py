@@ -148,7 +148,9 @@ class MABL(eqx.Module):
         key: PRNGKey,
         z_global: Float[Array, " KC"] | None = None,
     ) -> tuple[Latent, dict[str, Float[Array, "K C"]]]:
-        """One agent's transition model: a sample and its logits.
+        """One agent's transition model (section 3.1.1): a sample and its logits.
+
+        z^g_t ~ p(z^g_t | h^g_t),   z^a_t ~ p(z^a_t | h^a_t, z^g_t)
 
         The agent's prior sees `z_global` if given, else the global sample.
         """
