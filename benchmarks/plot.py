@@ -47,9 +47,9 @@ def ppo_curve(curve: dict) -> Curve:
     return Curve(np.cumsum(steps), *sums)
 
 
-def per_episode(curve: Curve, sums: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Sums over episodes in the window before each point of the grid; NaN without episodes."""
-    means = []
+def per_episode(curve: Curve, name: str, grid: np.ndarray) -> np.ndarray:
+    """`wins` or `returns` over episodes in the window before each point; NaN without episodes."""
+    sums, means = getattr(curve, name), []
     for end in grid:
         inside = (curve.steps > end - WINDOW) & (curve.steps <= end)
         total = curve.episodes[inside].sum()
@@ -71,12 +71,15 @@ def main() -> None:
     parser.add_argument("--runs", nargs="*", default=[], help="LABEL=GLOB of run folders")
     parser.add_argument("--ppo", nargs="*", default=[], help="LABEL=output of benchmarks/ppo.py")
     parser.add_argument("--title", default="")
+    parser.add_argument("--report", type=int, nargs="*", default=[12_000, 20_000, 40_000, 80_000])
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     groups = {}
     for item in args.runs:
         label, pattern = item.split("=", 1)
         groups[label] = [run_curve(Path(path)) for path in sorted(glob(pattern))]
+        if not groups[label]:
+            parser.error(f"no run folder matches {pattern}")
     for item in args.ppo:
         label, path = item.split("=", 1)
         curves = json.loads(Path(path).read_text())["curves"]
@@ -87,11 +90,13 @@ def main() -> None:
     figure = Figure(figsize=(10, 4), layout="constrained")
     won, earned = figure.subplots(1, 2)
     for label, curves in groups.items():
-        rates = np.stack([per_episode(curve, curve.wins, grid) for curve in curves])
+        rates = np.stack([per_episode(curve, "wins", grid) for curve in curves])
         draw(won, grid, label, rates)
-        draw(earned, grid, label, np.stack([per_episode(c, c.returns, grid) for c in curves]))
-        at_20k = [float(rate[19]) for rate in rates if len(rate) > 19]
-        print(label, "win rate at 20k steps:", [round(rate, 3) for rate in at_20k])
+        draw(earned, grid, label, np.stack([per_episode(c, "returns", grid) for c in curves]))
+        for steps in args.report:
+            if steps <= longest:
+                at = rates[:, steps // 1_000 - 1].round(2).tolist()
+                print(f"{label}: win rate at {steps:,} steps {at}")
     won.set(ylabel="win rate in training", ylim=(0, 1))
     earned.set(ylabel="episode return in training", ylim=(0, None))
     for axis in (won, earned):

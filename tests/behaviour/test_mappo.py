@@ -299,13 +299,17 @@ def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fres
         config = replace(TINY, replay_value_coef=coef)
         return mappo.update(fresh, trajectory, jax.random.key(0), config, replayed)
 
-    (plain, _), (taught, metrics), (deaf, _) = updated(0, None), updated(1, real), updated(0, real)
+    (plain, _), (taught, metrics), (deaf, _) = (
+        updated(0.0, None),
+        updated(1.0, real),
+        updated(0.0, real),
+    )
     assert same(plain.actor, taught.actor)
     assert same(plain.critic, deaf.critic)
     assert (taught.critic(real.critic_features[0]) > plain.critic(real.critic_features[0])).all()
     assert metrics["behaviour/replay_critic_loss"] > 10  # 0.5 (9 - about 0)^2, falling
     nothing = real._replace(weight=jnp.zeros((6, 2)))
-    assert same(plain.critic, updated(1, nothing)[0].critic)
+    assert same(plain.critic, updated(1.0, nothing)[0].critic)
 
 
 # --- with a real world model ------------------------------------------------------------------

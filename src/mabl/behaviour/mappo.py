@@ -1,5 +1,6 @@
 """Multi-agent PPO on latent trajectories (section 3.3, Table 3, [46])."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 from typing import ClassVar, NamedTuple
@@ -86,6 +87,10 @@ class MAPPOConfig:
             )
 
 
+ValueFunction = Callable[[Float[Array, "N G"]], Float[Array, " N"]]
+"""What a critic is to the losses: features of a team to a value for each agent."""
+
+
 class MAPPO(NamedTuple):
     """Everything that learning to act changes."""
 
@@ -150,7 +155,7 @@ def init(config: MAPPOConfig, n_actor: int, n_critic: int, n_actions: int, key: 
 
 
 def experience(
-    critic: Critic, trajectory: Trajectory, config: MAPPOConfig
+    critic: ValueFunction, trajectory: Trajectory, config: MAPPOConfig
 ) -> tuple[PPORows, Metrics]:
     """Lambda-returns and advantages of trajectories, flattened to joint rows."""
     weight, reward = trajectory.weight, shared_reward(trajectory.reward, config)
@@ -192,7 +197,7 @@ def shared_reward(reward: Float[Array, "*b N"], config: MAPPOConfig) -> Float[Ar
 
 
 def replayed_values(
-    critic: Critic, features: Float[Array, "T N G"], rows: TimeStep, config: MAPPOConfig
+    critic: ValueFunction, features: Float[Array, "T N G"], rows: TimeStep, config: MAPPOConfig
 ) -> ValueRows:
     """Lambda-returns along one real sequence `[T, ...]`, whoever acted in it (ADR 8).
 
@@ -234,7 +239,7 @@ def actor_loss(
 
 
 def critic_loss(
-    critic: Critic, rows: PPORows | ValueRows, value_coef: float
+    critic: ValueFunction, rows: PPORows | ValueRows, value_coef: float
 ) -> tuple[Float[Array, ""], Metrics]:
     """`value_coef` times the squared error to the lambda-returns."""
     error = jax.vmap(critic)(rows.critic_features) - rows.target
