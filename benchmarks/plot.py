@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from mabl.runs.metrics import read
 
@@ -94,13 +95,14 @@ def main() -> None:
         draw(won, grid, label, rates)
         draw(earned, grid, label, np.stack([per_episode(c, "returns", grid) for c in curves]))
         for steps in args.report:
-            if steps <= longest:
-                at = rates[:, steps // 1_000 - 1].round(2).tolist()
+            at = rates[:, grid == steps].round(2).ravel().tolist()
+            if at and not np.isnan(at).any():
                 print(f"{label}: win rate at {steps:,} steps {at}")
     won.set(ylabel="win rate in training", ylim=(0, 1))
     earned.set(ylabel="episode return in training", ylim=(0, None))
     for axis in (won, earned):
         axis.set(xlabel="environment steps")
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.grid(alpha=0.3)
     won.legend(frameon=False)
     figure.suptitle(args.title)

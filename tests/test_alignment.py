@@ -151,7 +151,7 @@ def test_starts_pair_each_latent_with_its_own_rows_availability_and_end(drawn, n
 
 
 def test_starts_that_end_an_episode_are_drawn_last_and_none_twice(drawn):
-    rows, *_ = drawn
+    rows = jax.tree.map(jnp.asarray, drawn[0])
     number = jnp.arange(32 * LENGTH).reshape(32, LENGTH)
     t, episode = np.moveaxis(rows.state, -1, 0)
     going_on = int(np.where(episode % 2 == 0, t != 5, t != 7).sum())
