@@ -27,7 +27,7 @@ PAPER_MODEL_LEARNING_RATE = {"smax/3s_vs_5z": 5e-4}
 QUICK = {
     "smax": Config(
         preset="quick",
-        total_steps=40_000,
+        total_steps=60_000,
         training=TrainingConfig(
             num_envs=16,
             collect_steps=16,
@@ -40,13 +40,13 @@ QUICK = {
         ),
         world_model=WorldModelConfig(
             hidden=128,
-            n_categoricals=16,
-            n_classes=16,
-            obs_weight=16.0,
+            n_categoricals=8,
+            n_classes=8,
+            obs_weight=4.0,
             reward_input="both",
             reward_loss="mse",
             kl_reduction="sum",
-            kl_weight=0.03,
+            kl_weight=0.1,
             overshooting=1.0,
             learning_rate=1e-3,
             batch_size=16,
