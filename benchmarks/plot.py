@@ -72,7 +72,9 @@ def main() -> None:
     parser.add_argument("--runs", nargs="*", default=[], help="LABEL=GLOB of run folders")
     parser.add_argument("--ppo", nargs="*", default=[], help="LABEL=output of benchmarks/ppo.py")
     parser.add_argument("--title", default="")
-    parser.add_argument("--report", type=int, nargs="*", default=[12_000, 20_000, 40_000, 80_000])
+    parser.add_argument(
+        "--report", type=int, nargs="*", default=[12_000, 20_000, 40_000, 60_000, 80_000]
+    )
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     groups = {}

@@ -14,7 +14,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     names = sorted(known)
     task = name.rpartition("/")[2]
     near = get_close_matches(name, names, n=3, cutoff=0.5) or [
-        known for known in names if known.endswith(f"/{task}")
+        other for other in names if other.endswith(f"/{task}")
     ]
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     return UserError(f"unknown {kind} {name!r}: {hint}choose from {', '.join(names)}")
