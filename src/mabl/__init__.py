@@ -8,7 +8,7 @@ policy = mabl.Policy.load(outcome.folders[0])
 from mabl.algorithms.config import Config
 from mabl.algorithms.presets import preset
 from mabl.errors import UserError
-from mabl.policy import Policy
+from mabl.policy import Policy, TeamPolicy
 from mabl.training.run import resume, train
 
-__all__ = ["Config", "Policy", "UserError", "preset", "resume", "train"]
+__all__ = ["Config", "Policy", "TeamPolicy", "UserError", "preset", "resume", "train"]

@@ -5,15 +5,18 @@ import json
 import os
 import sys
 from argparse import ArgumentParser
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from mabl.errors import UserError, unknown_name
+
+if TYPE_CHECKING:
+    from mabl.algorithms.config import Config
 
 PIPED_WIDTH = 160
 """Columns of a table that goes to a file or another program."""
@@ -57,7 +60,6 @@ def run(arguments: list[str]) -> int:
 
 def train(arguments: list[str]) -> int:
     """Train an algorithm in an environment."""
-    from mabl.algorithms.config import Config
     from mabl.algorithms.presets import preset
 
     base = ArgumentParser(add_help=False, allow_abbrev=False)
@@ -65,13 +67,32 @@ def train(arguments: list[str]) -> int:
         base.add_argument(flag, default=default)
     chosen, rest = base.parse_known_args(arguments)
     default = preset(chosen.preset, chosen.env, chosen.algo)
-    config = tyro.cli(
-        Config, args=rest, default=default, prog="mabl train", description=train.__doc__
-    )
+    config = parse_config(rest, default)
     from mabl.training.run import train as train_run
 
     use_compilation_cache()
     return INTERRUPTED if train_run(config).interrupted else 0
+
+
+def parse_config(arguments: list[str], default: "Config") -> "Config":
+    """`default` with flags applied; sections that the algorithm does not read have no flags."""
+    from mabl.algorithms.config import Config
+    from mabl.algorithms.registry import entry
+
+    unread = [
+        (section, Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress], getattr(default, section))
+        for section in Config.sections()
+        if section not in entry(default.algo).sections
+    ]
+    flags = make_dataclass("Config", unread, bases=(Config,), frozen=True)
+    given = tyro.cli(
+        flags,
+        args=arguments,
+        default=flags(**shallow(default)),
+        prog="mabl train",
+        description=train.__doc__,
+    )
+    return Config(**shallow(given))
 
 
 @dataclass(frozen=True)
@@ -172,12 +193,20 @@ def list_envs(arguments: list[str]) -> None:
 def list_algos(arguments: list[str]) -> None:
     """List algorithms."""
     tyro.cli(lambda: None, args=arguments, prog="mabl algos", description=list_algos.__doc__)
-    from mabl.algorithms.registry import ALGORITHMS
+    from mabl.algorithms.registry import ALGORITHMS, COLUMNS
 
-    table = Table("name", "description", box=None)
+    table = Table(box=None, padding=(0, 1))
+    for heading in ("name", *(column.heading for column in COLUMNS), "description"):
+        table.add_column(heading, no_wrap=heading == "name")
     for name, entry in ALGORITHMS.items():
-        table.add_row(name, entry.description)
+        marks = ("yes" if getattr(entry, column.field) else "no" for column in COLUMNS)
+        table.add_row(name, *marks, entry.description)
     print_table(table)
+
+
+def shallow(config: Any) -> dict[str, Any]:
+    """A dataclass's fields, one level deep."""
+    return {f.name: getattr(config, f.name) for f in fields(config)}
 
 
 def print_table(table: Table) -> None:

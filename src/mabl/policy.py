@@ -1,4 +1,4 @@
-"""A trained policy, taken away: one agent, its own observations, its own latent state."""
+"""A trained policy, taken away: by one agent with its own observations, or by a whole team."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -6,16 +6,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from mabl.algorithms import registry as algorithms
 from mabl.algorithms.config import Config
 from mabl.envs import registry as envs
 from mabl.envs.base import CompiledEnv, EnvSpec
 from mabl.errors import UserError
-from mabl.execution import LocalExecutor, act_alone
+from mabl.execution import JointExecutor, LocalExecutor, act_alone, executor_of
 from mabl.runs import folder
 from mabl.runs.checkpoint import Checkpoints
+from mabl.types import TimeStep
 
 
 class LoadedRun(NamedTuple):
@@ -23,7 +24,7 @@ class LoadedRun(NamedTuple):
 
     config: Config
     env: CompiledEnv
-    executor: LocalExecutor
+    executor: LocalExecutor | JointExecutor
     step: int
     """Environment steps at which the checkpoint was written."""
 
@@ -42,7 +43,7 @@ def load_run(path: Path | str, env: str | None = None, greedy: bool = True) -> L
     algorithm = algorithms.make(config, trained_in.spec)
     shape = jax.eval_shape(lambda key: algorithm.policy(algorithm.init(key)), jax.random.key(0))
     policy = checkpoints.restore("policy", shape)
-    executor = algorithm.executor(policy, greedy)
+    executor = executor_of(policy, trained_in.spec.action_space, greedy)
     return LoadedRun(config, played_in, executor, checkpoints.latest)
 
 
@@ -59,6 +60,67 @@ def check_fits(trained: EnvSpec, played: EnvSpec) -> None:
                 f"{played.name} has {found} {what}, the checkpoint expects {expected}: "
                 f"pass --env {trained.name}"
             )
+
+
+class TeamPolicy:
+    """A team's policy: all observations in one place, one call a step. Any algorithm has one.
+
+    team = TeamPolicy.load("runs/smax/3m/mamba/seed_0/20260101-120000")
+    team.reset()                                   # at the start of an episode
+    actions = team.act(obs, available, alive)      # once a step
+    """
+
+    def __init__(self, executor: LocalExecutor | JointExecutor, n_agents: int, seed: int = 0):
+        self._executor = executor
+        self._n_agents = n_agents
+        self._key = jax.random.key(seed)
+        self._act = jax.jit(executor.act)
+        self.reset()
+
+    @classmethod
+    def load(cls, run: Path | str, greedy: bool = True, seed: int = 0) -> "TeamPolicy":
+        """The newest policy of a run folder; `seed` decides what it samples.
+
+        Raises UserError if the folder is not a run.
+        """
+        loaded = load_run(run, greedy=greedy)
+        return cls(loaded.executor, loaded.env.spec.n_agents, seed)
+
+    def reset(self) -> None:
+        """Forget the episode so far."""
+        self._memory = None
+
+    def act(
+        self, obs: ArrayLike, available: ArrayLike | None = None, alive: ArrayLike | None = None
+    ) -> np.ndarray:
+        """The joint action at observations `[N, O]`, of those available `[N, A]` (None: all).
+
+        `alive` `[N]` (None: all) says who is there to be heard. Raises UserError if the sizes are
+        not those that the policy was trained with.
+        """
+        n, space = self._n_agents, self._executor.action_space
+        obs = checked("obs", obs, (n, self._executor.policy.filter.obs_dim), np.float32)
+        everything = np.ones((n, space.size), bool)
+        available = everything if available is None else available
+        is_first = self._memory is None
+        if is_first:
+            self._prev_action = jnp.zeros((n, *space.shape), space.dtype)
+        row = TimeStep(
+            prev_action=self._prev_action,
+            reward=jnp.zeros(n),
+            terminated=jnp.zeros(n, bool),
+            truncated=jnp.bool_(False),
+            obs=jnp.asarray(obs),
+            state=jnp.zeros(0),
+            available=jnp.asarray(checked("available", available, (n, space.size), bool)),
+            alive=jnp.asarray(checked("alive", np.ones(n) if alive is None else alive, (n,), bool)),
+            is_first=jnp.bool_(is_first),
+            score=jnp.float32(jnp.nan),
+        )
+        self._key, key = jax.random.split(self._key)
+        memory = self._executor.initial(row) if is_first else self._memory
+        self._memory, self._prev_action = self._act(memory, row, key)
+        return np.asarray(self._prev_action)
 
 
 class Policy:
@@ -80,14 +142,21 @@ class Policy:
         """The newest policy of a run folder; load one for each agent, with a seed of its own.
 
         `seed` decides the samples of the latent state, and of the actions unless `greedy`.
-        Raises UserError if the folder is not a run.
+        Raises UserError if the folder is not a run, or one of an algorithm whose agents cannot act
+        alone.
         """
-        return cls(load_run(run, greedy=greedy).executor, seed)
+        loaded = load_run(run, greedy=greedy)
+        if not isinstance(loaded.executor, LocalExecutor):
+            raise UserError(
+                f"{loaded.config.algo} executes centrally, there is no policy of one agent: "
+                "use TeamPolicy"
+            )
+        return cls(loaded.executor, seed)
 
     def reset(self) -> None:
         """Forget the episode so far."""
         space = self._executor.action_space
-        self._level = self._executor.policy.filter.initial()
+        self._memory = self._executor.policy.filter.initial()
         self._prev_action = jnp.zeros(space.shape, space.dtype)
         self._is_first = True
 
@@ -96,28 +165,24 @@ class Policy:
 
         Raises UserError if the sizes are not those that the policy was trained with.
         """
-        n_obs = self._executor.policy.filter.encoder.layers[0].weight.shape[0]
         n_actions = self._executor.action_space.size
-        obs = np.asarray(obs, np.float32)
-        mask = np.ones(n_actions, bool) if available is None else np.asarray(available, bool)
-        if obs.shape != (n_obs,):
-            raise UserError(f"obs has shape {obs.shape}, the policy expects ({n_obs},)")
-        if mask.shape != (n_actions,):
-            raise UserError(f"available has shape {mask.shape}, the policy expects ({n_actions},)")
+        obs = checked("obs", obs, (self._executor.policy.filter.obs_dim,), np.float32)
+        mask = np.ones(n_actions, bool) if available is None else available
+        mask = checked("available", mask, (n_actions,), bool)
         self._key, key = jax.random.split(self._key)
-        self._level, self._prev_action = self._act(
-            self._level, self._prev_action, obs, mask, self._is_first, key
+        self._memory, self._prev_action = self._act(
+            self._memory, self._prev_action, obs, mask, self._is_first, key
         )
         self._is_first = False
         action = np.asarray(self._prev_action)
         return int(action) if action.ndim == 0 else action
 
-    def _act_once(self, level, prev_action, obs, available, is_first, key):
+    def _act_once(self, memory, prev_action, obs, available, is_first, key):
         executor = self._executor
         return act_alone(
             executor.policy,
             executor.action_space,
-            level,
+            memory,
             prev_action,
             obs,
             available,
@@ -125,3 +190,11 @@ class Policy:
             key,
             executor.greedy,
         )
+
+
+def checked(name: str, given: ArrayLike, shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
+    """An array of that type. Raises UserError for another shape."""
+    array = np.asarray(given, dtype)
+    if array.shape != shape:
+        raise UserError(f"{name} has shape {array.shape}, the policy expects {shape}")
+    return array

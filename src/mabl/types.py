@@ -1,4 +1,4 @@
-"""The two rows of data that flow through the house: what happened, and what was imagined.
+"""The rows of data that flow through the house: what happened, and what was imagined.
 
 Time convention (one for the whole project): row t holds the action that led to it, the reward
 received on arriving, and everything observed there. A reset is a row of its own; the terminal
@@ -49,19 +49,28 @@ def is_last(row: TimeStep) -> Bool[Array, "*b"]:
     return row.truncated | row.terminated.all(-1)
 
 
+class TeamView(NamedTuple):
+    """What learning to act sees of a latent."""
+
+    actor_features: Float[Array, "*b N F"]
+    """What each agent's policy sees: in execution, too."""
+    critic_features: Float[Array, "*b N G"]
+    """What only training sees: the input of the centralised critic, or of QMIX's mixer."""
+    available: Bool[Array, "*b N A"]
+    """Actions that may be taken."""
+    alive: Bool[Array, "*b N"]
+    """Attention over agents leaves out those that are not."""
+
+
 class Trajectory(NamedTuple):
     """Imagined latent trajectories D_L of section 3.3; H rows, H - 1 transitions, a batch axis B.
 
     Row h of `action` is taken at row h and leads to row h + 1, so that these fields are one row
-    shorter than the features.
+    shorter than the view.
     """
 
-    actor_features: Float[Array, "H B N F"]
-    """z_agent and h_agent of every agent."""
-    critic_features: Float[Array, "H B N G"]
-    """What the centralised critic sees."""
-    available: Bool[Array, "H B N A"]
-    """Availability sampled from the model; at the start row the real one."""
+    view: TeamView
+    """`[H, B, N, ...]`; availability and life are real at the start row, then the model's."""
     action: Shaped[Array, "H-1 B N ..."]
     log_prob: Float[Array, "H-1 B N"]
     """log pi(action) at the time of imagination."""
@@ -72,6 +81,13 @@ class Trajectory(NamedTuple):
     weight: Float[Array, "H-1 B N"]
     """How much a row counts: the model's probability that the episode gets there; 0 where the start
     ends an episode."""
+
+
+class Replayed(NamedTuple):
+    """Real sequences `[B, T, ...]` and what learning to act sees of their posterior latents."""
+
+    view: TeamView
+    rows: TimeStep
 
 
 Metrics = dict[str, Any]

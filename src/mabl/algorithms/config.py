@@ -8,8 +8,12 @@ from math import inf
 from typing import Any, ClassVar, Literal, TypeVar
 
 from mabl.behaviour.mappo import MAPPOConfig
+from mabl.behaviour.qmix import QMIXConfig
+from mabl.behaviour.recurrent import RecurrentMAPPOConfig
 from mabl.errors import UserError, require_between, require_positive, unknown_name
+from mabl.imagination import ImaginationConfig
 from mabl.world_models.base import WorldModelConfig
+from mabl.world_models.mamba import CommunicationConfig
 
 T = TypeVar("T")
 
@@ -51,8 +55,29 @@ class TrainingConfig:
 
 
 @dataclass(frozen=True)
+class LookaheadConfig:
+    """How MAG chooses among imagined latents. Defaults are MAG's."""
+
+    FLAG_PREFIX: ClassVar[str] = "lookahead."
+
+    candidates: int = 4
+    """Next latents drawn at every imagined step, of which one is kept."""
+    steps: int = 6
+    """Imagined steps after a candidate over which predicted model errors are summed."""
+    hidden: int = 256
+    """Width of the error predictor."""
+    n_hidden: int = 4
+    """Hidden layers of the error predictor."""
+    learning_rate: float = 5e-4
+    """Adam's learning rate for the error predictor."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "candidates", "steps", "hidden", "n_hidden", "learning_rate")
+
+
+@dataclass(frozen=True)
 class Config:
-    """One training run."""
+    """One training run; an algorithm reads the sections that the registry names for it."""
 
     env: str = "smax/3m"
     """Environment: `mabl envs` lists them."""
@@ -70,19 +95,21 @@ class Config:
     """Where run folders go: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+    communication: CommunicationConfig = field(default_factory=CommunicationConfig)
+    imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
+    lookahead: LookaheadConfig = field(default_factory=LookaheadConfig)
     mappo: MAPPOConfig = field(default_factory=MAPPOConfig)
+    qmix: QMIXConfig = field(default_factory=QMIXConfig)
+    recurrent_mappo: RecurrentMAPPOConfig = field(default_factory=RecurrentMAPPOConfig)
+
+    @classmethod
+    def sections(cls) -> list[str]:
+        """Names of the fields that are configurations themselves."""
+        return [f.name for f in fields(cls) if is_dataclass(f.type)]
 
     def __post_init__(self) -> None:
         require_positive(self, "total_steps", "num_seeds")
         require_between(self, 0, 2**32 - self.num_seeds, "seed")
-        rows = self.training.replay_capacity // self.training.num_envs
-        needed = max(self.world_model.batch_length, self.training.collect_steps or 0)
-        if rows < needed:
-            raise UserError(
-                f"--training.replay-capacity {self.training.replay_capacity} leaves each of "
-                f"{self.training.num_envs} environments {rows} rows: give at least "
-                f"{needed * self.training.num_envs}"
-            )
 
 
 def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:

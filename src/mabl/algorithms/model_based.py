@@ -1,6 +1,7 @@
 """Learning a world model from replayed rows, and behaviour inside it (Algorithm 1, lines 5-14)."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,16 +10,16 @@ import optax
 from einops import rearrange
 from jaxtyping import Array, Float
 
+from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
 from mabl.algorithms.diagnostics import DIAGNOSED_ROWS, diagnose, masked_mean
-from mabl.behaviour import mappo
-from mabl.behaviour.mappo import MAPPO
+from mabl.behaviour.base import Behaviour
 from mabl.envs.base import EnvSpec
-from mabl.execution import LocalExecutor, LocalPolicy
-from mabl.imagination import imagine_trajectory
+from mabl.execution import Policy
+from mabl.imagination import Dream, Imagined, Step, imagine_trajectory
 from mabl.replay import Replay, sample_sequences
-from mabl.types import Metrics, PRNGKey, TimeStep, is_last
-from mabl.world_models.base import WorldModel, model_loss, observe_sequence
+from mabl.types import Metrics, PRNGKey, Replayed, TeamView, TimeStep, is_last
+from mabl.world_models.base import WorldModel, WorldModelConfig, model_loss, observe_sequence
 
 N_DIAGNOSED = 128
 """Sequences that diagnostics look at."""
@@ -29,45 +30,44 @@ class Learner(NamedTuple):
 
     model: WorldModel
     model_opt: optax.OptState
-    behaviour: MAPPO
+    behaviour: Any
 
 
 class ModelBased(NamedTuple):
-    """A world model and MAPPO inside its imagination."""
+    """A world model, and a behaviour that is learned in its imagination."""
 
-    world_model: type
+    world_model: Callable[[EnvSpec, WorldModelConfig, PRNGKey], WorldModel]
+    behaviour: Behaviour
     spec: EnvSpec
     config: Config
+
+    @property
+    def rows_needed(self) -> int:
+        """A sequence of the model's."""
+        return self.config.world_model.batch_length
 
     def init(self, key: PRNGKey) -> Learner:
         """Fresh parameters and optimisers."""
         key_model, key_behaviour = jax.random.split(key)
         model = self.world_model(self.spec, self.config.world_model, key_model)
-        latent = model.initial()
-        behaviour = mappo.init(
-            self.config.mappo,
-            n_actor=model.actor_features(latent).shape[-1],
-            n_critic=model.critic_features(latent).shape[-1],
-            n_actions=self.spec.action_space.size,
-            key=key_behaviour,
-        )
+        shape = (self.spec.n_agents, self.spec.action_space.size)
+        view = self._view(model, model.initial(), jnp.ones(shape, bool), jnp.ones(shape[0], bool))
+        behaviour = self.behaviour.init(view, shape[1], key_behaviour)
         return Learner(model, self._optimiser().init(eqx.filter(model, eqx.is_array)), behaviour)
 
-    def policy(self, learner: Learner) -> LocalPolicy:
+    def policy(self, learner: Learner) -> Policy:
         """What of the learner is needed to act: all that is exported or deployed."""
-        return LocalPolicy(learner.model.filter, learner.behaviour.actor)
-
-    def executor(self, policy: LocalPolicy, greedy: bool = False) -> LocalExecutor:
-        """How a policy acts in the environment."""
-        return LocalExecutor(policy, self.spec.action_space, greedy)
+        return Policy(learner.model.filter, self.behaviour.actor(learner.behaviour))
 
     def update_model(
-        self, learner: Learner, replay: Replay, key: PRNGKey
+        self, learner: Learner, experience: Experience, key: PRNGKey
     ) -> tuple[Learner, Metrics]:
         """Draw B_M sequences and train psi on L(psi) (lines 6-7)."""
         config = self.config.world_model
         key_sample, key_loss = jax.random.split(key)
-        rows = sample_sequences(replay, key_sample, config.batch_size, config.batch_length)
+        rows = sample_sequences(
+            experience.replay, key_sample, config.batch_size, config.batch_length
+        )
         gradient, metrics = eqx.filter_grad(model_loss, has_aux=True)(
             learner.model, rows, key_loss, config, self.spec.action_space
         )
@@ -77,59 +77,65 @@ class ModelBased(NamedTuple):
         return learner._replace(model=model, model_opt=model_opt), metrics
 
     def update_policy(
-        self, learner: Learner, replay: Replay, key: PRNGKey
+        self, learner: Learner, experience: Experience, key: PRNGKey, step: Step = Dream.step
     ) -> tuple[Learner, Metrics]:
         """Draw B_R sequences, imagine from their latents, train theta and phi (lines 10-13)."""
-        sizes, config = self.config.world_model, self.config.mappo
-        key_sample, key_observe, key_start, key_imagine, key_ppo = jax.random.split(key, 5)
-        rows = sample_sequences(replay, key_sample, sizes.batch_size, sizes.batch_length)
-        latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
-            learner.model, rows, jax.random.split(key_observe, sizes.batch_size)
-        )
-        start, available, weight = starts((latents, rows), key_start, config.n_starts)
+        sizes = self.config.world_model
+        key_sample, key_observe, key_start, key_imagine, key_learn = jax.random.split(key, 5)
+        rows = sample_sequences(experience.replay, key_sample, sizes.batch_size, sizes.batch_length)
+        latents = self._observe(learner, rows, key_observe)
+        start, weight = starts(latents, rows, key_start, self.config.imagination.n_starts)
+        dream = self.dream(learner)
         trajectory = jax.vmap(
-            lambda start, available, weight, key: imagine_trajectory(
-                learner.model,
-                learner.behaviour.actor,
-                start,
-                available,
-                weight,
-                key,
-                config.horizon,
-                self.spec.action_space,
-                config.sample_availability,
-            ),
-            out_axes=1,
-        )(start, available, weight, jax.random.split(key_imagine, weight.shape[0]))
-        replayed = None
-        if config.replay_value_coef:
-            features = jax.vmap(jax.vmap(learner.model.critic_features))(latents)
-            replayed = jax.vmap(
-                lambda features, rows: mappo.replayed_values(
-                    learner.behaviour.critic, features, rows, config
-                )
-            )(features, rows)
-            replayed = jax.tree.map(lambda x: rearrange(x, "b t ... -> (b t) ..."), replayed)
-        behaviour, metrics = mappo.update(learner.behaviour, trajectory, key_ppo, config, replayed)
+            lambda *start: imagine_trajectory(dream, *start, step=step), out_axes=1
+        )(start, weight, jax.random.split(key_imagine, weight.shape[0]))
+        view = jax.vmap(jax.vmap(lambda *state: self._view(learner.model, *state)))(
+            latents, rows.available, rows.alive
+        )
+        behaviour, metrics = self.behaviour.update(
+            learner.behaviour, trajectory, Replayed(view, rows), key_learn
+        )
         return learner._replace(behaviour=behaviour), metrics
 
     def diagnose(self, learner: Learner, replay: Replay, key: PRNGKey) -> Metrics:
-        """How well the world model predicts sequences of the replay, and what the critic expects.
+        """How well the world model predicts sequences of the replay, and what is expected of them.
 
         `behaviour/value_at_reset` is in the environment's units: it compares with episode returns.
         """
         key_sample, key_observe, key_diagnose = jax.random.split(key, 3)
         rows = sample_sequences(replay, key_sample, N_DIAGNOSED, DIAGNOSED_ROWS)
-        latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
-            learner.model, rows, jax.random.split(key_observe, N_DIAGNOSED)
-        )
+        latents = self._observe(learner, rows, key_observe)
         metrics = diagnose(learner.model, latents, rows, key_diagnose, self.spec.action_space)
-        features = jax.vmap(jax.vmap(learner.model.critic_features))(latents)
-        value = jax.vmap(jax.vmap(learner.behaviour.critic))(features).mean(-1)
+
+        def value(latent: Any, row: TimeStep) -> Array:
+            view = self._view(learner.model, latent, row.available, row.alive)
+            return self.behaviour.value(learner.behaviour, view).mean()
+
         metrics["behaviour/value_at_reset"] = (
-            masked_mean(value, rows.is_first) / self.config.training.reward_scale
+            masked_mean(jax.vmap(jax.vmap(value))(latents, rows), rows.is_first)
+            / self.config.training.reward_scale
         )
         return metrics
+
+    def dream(self, learner: Learner) -> Dream:
+        """The learner's model and policy, ready to imagine."""
+        return Dream(
+            learner.model,
+            self.behaviour.actor(learner.behaviour),
+            self.spec.action_space,
+            self.config.imagination,
+            lambda latent: self.behaviour.critic_features(learner.model, latent),
+        )
+
+    def _observe(self, learner: Learner, rows: TimeStep, key: PRNGKey) -> Any:
+        """Posterior latents of sequences `[B, T, ...]`."""
+        keys = jax.random.split(key, rows.is_first.shape[0])
+        return jax.vmap(lambda *at: observe_sequence(learner.model, *at)[0])(rows, keys)
+
+    def _view(self, model: WorldModel, latent: Any, available: Array, alive: Array) -> TeamView:
+        """What behaviour sees of one row's latent."""
+        features = self.behaviour.critic_features(model, latent)
+        return TeamView(model.actor_features(latent), features, available, alive)
 
     def _optimiser(self) -> optax.GradientTransformation:
         config = self.config.world_model
@@ -139,18 +145,18 @@ class ModelBased(NamedTuple):
 
 
 def starts(
-    observed: tuple[object, TimeStep], key: PRNGKey, n_starts: int | None
-) -> tuple[object, Array, Float[Array, " S"]]:
-    """Start latents `[S, ...]`, their real availability, and 0 where the row ends an episode.
+    latents: Any, rows: TimeStep, key: PRNGKey, n_starts: int | None
+) -> tuple[Imagined, Float[Array, " S"]]:
+    """Where imagination begins, `[S, ...]`, and 0 where the row ends an episode.
 
     All posterior states of the batch `[B, T]`, or `n_starts` of them drawn without replacement,
-    rows that do not end an episode first.
+    rows that do not end an episode first. Availability and life are the real ones.
     """
-    flat = jax.tree.map(lambda x: rearrange(x, "b t ... -> (b t) ..."), observed)
-    latents, rows = flat
-    weight = 1.0 - is_last(rows)
-    chosen = (latents, rows.available, weight)
+    states = Imagined(latents, rows.available, rows.alive)
+    states, weight = jax.tree.map(
+        lambda x: rearrange(x, "b t ... -> (b t) ..."), (states, 1.0 - is_last(rows))
+    )
     if n_starts is None:
-        return chosen
+        return states, weight
     order = jnp.argsort(jax.random.uniform(key, weight.shape) - 2 * weight)[:n_starts]
-    return jax.tree.map(lambda x: x[order], chosen)
+    return jax.tree.map(lambda x: x[order], (states, weight))

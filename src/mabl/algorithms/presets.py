@@ -1,11 +1,13 @@
 """Presets as data: the paper's tables, and settings sized for a 2-core CPU."""
 
 from dataclasses import replace
+from typing import Any
 
 from mabl.algorithms.config import Config, TrainingConfig
 from mabl.behaviour.mappo import MAPPOConfig
 from mabl.envs import registry
 from mabl.errors import unknown_name
+from mabl.imagination import ImaginationConfig
 from mabl.world_models.base import WorldModelConfig
 
 SMAX_REWARD_SCALE = 10.0
@@ -58,9 +60,8 @@ QUICK = {
             critic_learning_rate=1e-3,
             ent_coef=0.02,
             replay_value_coef=1.0,
-            horizon=6,
-            sample_availability=False,
         ),
+        imagination=ImaginationConfig(horizon=6, sample_availability=False),
     ),
     "test": Config(
         preset="quick",
@@ -93,13 +94,59 @@ QUICK = {
             actor_out_scale=0.01,
             actor_learning_rate=5e-4,
             ent_coef=0.1,
-            horizon=6,
-            n_starts=128,
         ),
+        imagination=ImaginationConfig(horizon=6, n_starts=128),
     ),
 }
 
 PRESETS = {"quick": QUICK, "paper": PAPER}
+
+# MAMBA's own rates; all else is as matched as its sizes.
+_MAMBA_PAPER = {
+    "world_model": {"learning_rate": 2e-4},
+    "mappo": {"actor_learning_rate": 5e-4, "critic_learning_rate": 5e-4},
+}
+# No model to train, and no rows kept beyond a cycle's.
+_ON_POLICY = {"model_updates": 0, "policy_updates": 1, "prefill_steps": 0, "pretrain_updates": 0}
+
+BY_ALGORITHM: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
+    ("paper", "smax", "mamba"): _MAMBA_PAPER,
+    ("paper", "smax", "mag"): _MAMBA_PAPER,
+    # The recipe's rollouts: 8 environments for 400 rows.
+    ("paper", "smax", "mappo"): {
+        "training": _ON_POLICY | {"num_envs": 8, "collect_steps": 400, "replay_capacity": 3_200},
+    },
+    ("quick", "smax", "mappo"): {
+        "training": _ON_POLICY | {"num_envs": 16, "collect_steps": 64, "replay_capacity": 1_024},
+        "recurrent_mappo": {
+            "learning_rate": 1e-3,
+            "n_epochs": 10,
+            "n_minibatches": 2,
+            "chunk_length": 16,
+        },
+    },
+    ("quick", "smax", "mabl-qmix"): {
+        "qmix": {
+            "hidden": 128,
+            "learning_rate": 1e-3,
+            "batch_size": 500,
+            "epsilon_updates": 80,
+        },
+    },
+    ("quick", "test", "mappo"): {
+        "training": _ON_POLICY | {"num_envs": 16, "collect_steps": 40, "replay_capacity": 640},
+        "recurrent_mappo": {"learning_rate": 2e-3, "n_epochs": 10},
+    },
+    ("quick", "test", "mabl-qmix"): {
+        "qmix": {
+            "hidden": 64,
+            "learning_rate": 1e-3,
+            "batch_size": 200,
+            "epsilon_updates": 60,
+        },
+    },
+}
+"""What an algorithm changes in a preset of a family: sections' fields by (preset, family, algo)."""
 
 
 def preset(name: str, env: str, algo: str) -> Config:
@@ -114,6 +161,10 @@ def preset(name: str, env: str, algo: str) -> Config:
     if family not in families:
         raise registry.unknown(env)
     config = replace(families[family], env=env, algo=algo)
+    changes = BY_ALGORITHM.get((name, family, algo), {})
+    config = replace(
+        config, **{key: replace(getattr(config, key), **new) for key, new in changes.items()}
+    )
     if name == "paper" and env in PAPER_MODEL_LEARNING_RATE:
         rate = PAPER_MODEL_LEARNING_RATE[env]
         config = replace(config, world_model=replace(config.world_model, learning_rate=rate))

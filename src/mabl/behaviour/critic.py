@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mabl.nets.attention import SelfAttention
 from mabl.nets.mlp import MLP, Linear
@@ -10,7 +10,10 @@ from mabl.types import PRNGKey
 
 
 class Critic(eqx.Module):
-    """V(z_agent, z_global, h_agent, h_global) of each agent, attending to all agents."""
+    """V of each agent given its features, e.g. (z_agent, z_global, h_agent, h_global).
+
+    It attends to the features of all agents that are alive.
+    """
 
     embed: Linear
     attention: SelfAttention
@@ -22,8 +25,10 @@ class Critic(eqx.Module):
         self.attention = SelfAttention(hidden, n_heads, key_attention)
         self.mlp = MLP(hidden, 1, hidden, n_hidden, key_mlp)
 
-    def __call__(self, features: Float[Array, "N G"]) -> Float[Array, " N"]:
+    def __call__(
+        self, features: Float[Array, "N G"], alive: Bool[Array, " N"]
+    ) -> Float[Array, " N"]:
         """One value for each agent of a team."""
         x = jax.nn.relu(jax.vmap(self.embed)(features))
-        x = x + self.attention(x)
+        x = x + self.attention(x, alive)
         return jax.vmap(self.mlp)(x)[:, 0]

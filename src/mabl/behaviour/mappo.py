@@ -3,21 +3,21 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
 from einops import rearrange
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from mabl.behaviour.actor import Actor
+from mabl.behaviour.actor import Actor, MaskedCategorical
 from mabl.behaviour.critic import Critic
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.ppo import clipped_surrogate
 from mabl.losses.returns import lambda_returns
-from mabl.types import Metrics, PRNGKey, TimeStep, Trajectory
+from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 
 
 @dataclass(frozen=True)
@@ -65,33 +65,24 @@ class MAPPOConfig:
     """Give advantages zero mean and unit variance over the imagined rows."""
     team_reward: bool = True
     """Average predicted rewards over agents (SMAC, MAMuJoCo)."""
-    horizon: int = 15
-    """Rows of an imagined trajectory, the start included."""
-    n_starts: int | None = None
-    """Start states drawn from the posterior states of a batch; None: all, as in the paper."""
-    sample_availability: bool = True
-    """Sample the availability of imagined actions, as in the paper, or take its mode."""
 
     def __post_init__(self) -> None:
-        require_positive(
-            self, "hidden", "n_hidden", "n_heads", "n_epochs", "batch_size", "n_starts"
-        )
+        require_positive(self, "hidden", "n_hidden", "n_heads", "n_epochs", "batch_size")
         require_positive(self, "actor_learning_rate", "critic_learning_rate", "grad_clip", "clip")
         require_between(self, 0, 1, "gamma", "gae_lambda", "ent_decay")
         require_between(self, 0, inf, "actor_weight_decay", "ent_coef", "value_coef")
         require_between(self, 0, inf, "replay_value_coef")
-        require_between(self, 2, inf, "horizon")
         if self.hidden % self.n_heads:
             raise UserError(
                 f"--mappo.hidden is {self.hidden}: give a multiple of its {self.n_heads} heads"
             )
 
 
-ValueFunction = Callable[[Float[Array, "N G"]], Float[Array, " N"]]
-"""What a critic is to the losses: features of a team to a value for each agent."""
+ValueFunction = Callable[[Float[Array, "N G"], Bool[Array, " N"]], Float[Array, " N"]]
+"""What a critic is to the losses: features of a team and who is alive to a value for each agent."""
 
 
-class MAPPO(NamedTuple):
+class ActorCritic(NamedTuple):
     """Everything that learning to act changes."""
 
     actor: Actor
@@ -104,9 +95,7 @@ class MAPPO(NamedTuple):
 class PPORows(NamedTuple):
     """Joint rows of imagined experience, `[M, N, ...]`, as PPO's epochs see them."""
 
-    actor_features: Array
-    critic_features: Array
-    available: Array
+    view: TeamView
     action: Array
     log_prob: Array
     advantage: Array
@@ -117,9 +106,61 @@ class PPORows(NamedTuple):
 class ValueRows(NamedTuple):
     """Joint rows of real experience, `[*b, N, ...]`: what the critic alone learns from."""
 
-    critic_features: Array
+    view: TeamView
     target: Array
     weight: Array
+
+
+class MAPPO(NamedTuple):
+    """Multi-agent PPO: a shared actor, and a shared centralised critic on what all models offer."""
+
+    config: MAPPOConfig
+
+    def init(self, view: TeamView, n_actions: int, key: PRNGKey) -> ActorCritic:
+        """Fresh networks for features of the view's sizes."""
+        config = self.config
+        key_actor, key_critic = jax.random.split(key)
+        n_actor, n_critic = view.actor_features.shape[-1], view.critic_features.shape[-1]
+        actor = Actor(
+            n_actor, n_actions, config.hidden, config.n_hidden, config.actor_out_scale, key_actor
+        )
+        critic = Critic(n_critic, config.hidden, config.n_hidden, config.n_heads, key_critic)
+        actor_optimiser, critic_optimiser = optimisers(config)
+        return ActorCritic(
+            actor=actor,
+            critic=critic,
+            actor_opt=actor_optimiser.init(eqx.filter(actor, eqx.is_array)),
+            critic_opt=critic_optimiser.init(eqx.filter(critic, eqx.is_array)),
+            ent_coef=jnp.float32(config.ent_coef),
+        )
+
+    def actor(self, state: ActorCritic) -> Actor:
+        """The policy."""
+        return state.actor
+
+    def critic_features(self, model: Any, latent: Any) -> Float[Array, "N G"]:
+        """All that the model has for critics."""
+        return model.critic_features(latent)
+
+    def value(self, state: ActorCritic, view: TeamView) -> Float[Array, " N"]:
+        """The critic's."""
+        return state.critic(view.critic_features, view.alive)
+
+    def update(
+        self, state: ActorCritic, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
+    ) -> tuple[ActorCritic, Metrics]:
+        """`n_epochs` of minibatch PPO on one set of trajectories (Algorithm 1, lines 12-13).
+
+        With `replay_value_coef` the critic learns from replayed rows too, all of them in every
+        minibatch.
+        """
+        real = None
+        if self.config.replay_value_coef:
+            real = jax.vmap(lambda replayed: replayed_values(state.critic, replayed, self.config))(
+                replayed
+            )
+            real = jax.tree.map(lambda x: rearrange(x, "b t ... -> (b t) ..."), real)
+        return update(state, trajectory, key, self.config, real)
 
 
 def optimisers(
@@ -137,29 +178,13 @@ def optimisers(
     return actor, critic
 
 
-def init(config: MAPPOConfig, n_actor: int, n_critic: int, n_actions: int, key: PRNGKey) -> MAPPO:
-    """Fresh networks for features of sizes F = `n_actor` and G = `n_critic`."""
-    key_actor, key_critic = jax.random.split(key)
-    actor = Actor(
-        n_actor, n_actions, config.hidden, config.n_hidden, config.actor_out_scale, key_actor
-    )
-    critic = Critic(n_critic, config.hidden, config.n_hidden, config.n_heads, key_critic)
-    actor_optimiser, critic_optimiser = optimisers(config)
-    return MAPPO(
-        actor=actor,
-        critic=critic,
-        actor_opt=actor_optimiser.init(eqx.filter(actor, eqx.is_array)),
-        critic_opt=critic_optimiser.init(eqx.filter(critic, eqx.is_array)),
-        ent_coef=jnp.float32(config.ent_coef),
-    )
-
-
 def experience(
     critic: ValueFunction, trajectory: Trajectory, config: MAPPOConfig
 ) -> tuple[PPORows, Metrics]:
     """Lambda-returns and advantages of trajectories, flattened to joint rows."""
     weight, reward = trajectory.weight, shared_reward(trajectory.reward, config)
-    value = jax.vmap(jax.vmap(critic))(trajectory.critic_features)
+    view = trajectory.view
+    value = jax.vmap(jax.vmap(critic))(view.critic_features, view.alive)
     target = lambda_returns(
         reward, config.gamma * trajectory.continues, value[1:], config.gae_lambda
     )
@@ -177,9 +202,7 @@ def experience(
         "behaviour/advantage_std": std,
     }
     rows = PPORows(
-        trajectory.actor_features[:-1],
-        trajectory.critic_features[:-1],
-        trajectory.available[:-1],
+        jax.tree.map(lambda x: x[:-1], view),
         trajectory.action,
         trajectory.log_prob,
         centred / (std + 1e-5) if config.normalise_advantage else advantage,
@@ -196,15 +219,14 @@ def shared_reward(reward: Float[Array, "*b N"], config: MAPPOConfig) -> Float[Ar
     return jnp.broadcast_to(reward.mean(-1, keepdims=True), reward.shape)
 
 
-def replayed_values(
-    critic: ValueFunction, features: Float[Array, "T N G"], rows: TimeStep, config: MAPPOConfig
-) -> ValueRows:
+def replayed_values(critic: ValueFunction, replayed: Replayed, config: MAPPOConfig) -> ValueRows:
     """Lambda-returns along one real sequence `[T, ...]`, whoever acted in it (ADR 8).
 
     From an episode's last row to the next reset nothing passes: that step weighs nothing and hands
     back the last row's value, so that truncated episodes bootstrap.
     """
-    value = jax.vmap(critic)(features)
+    view, rows = replayed
+    value = jax.vmap(critic)(view.critic_features, view.alive)
     ends = rows.is_first[1:, None]
     target = lambda_returns(
         jnp.where(ends, value[:-1], shared_reward(rows.reward[1:], config)),
@@ -212,18 +234,26 @@ def replayed_values(
         value[1:],
         config.gae_lambda,
     )
-    return ValueRows(features[:-1], target, jnp.broadcast_to(1.0 - ends, target.shape))
+    seen = jax.tree.map(lambda x: x[:-1], view)
+    return ValueRows(seen, target, jnp.broadcast_to(1.0 - ends, target.shape))
 
 
 def actor_loss(
     actor: Actor, rows: PPORows, ent_coef: Float[Array, ""], clip: float
 ) -> tuple[Float[Array, ""], Metrics]:
+    """PPO's loss of the policy that an actor has at `rows`."""
+    policy = jax.vmap(jax.vmap(actor))(rows.view.actor_features, rows.view.available)
+    return policy_loss(policy, rows, ent_coef, clip)
+
+
+def policy_loss(
+    policy: MaskedCategorical, rows: PPORows, ent_coef: Float[Array, ""], clip: float
+) -> tuple[Float[Array, ""], Metrics]:
     """PPO's clipped surrogate minus the entropy bonus.
 
     Rows without a choice, such as those of the dead, do not count.
     """
-    weight = rows.weight * (rows.available.sum(-1) != 1)
-    policy = jax.vmap(jax.vmap(actor))(rows.actor_features, rows.available)
+    weight = rows.weight * (rows.view.available.sum(-1) != 1)
     log_prob = policy.log_prob(rows.action)
     surrogate = clipped_surrogate(log_prob, rows.log_prob, rows.advantage, clip)
     total = weight.sum() + 1e-8
@@ -242,23 +272,23 @@ def critic_loss(
     critic: ValueFunction, rows: PPORows | ValueRows, value_coef: float
 ) -> tuple[Float[Array, ""], Metrics]:
     """`value_coef` times the squared error to the lambda-returns."""
-    error = jax.vmap(critic)(rows.critic_features) - rows.target
+    error = jax.vmap(critic)(rows.view.critic_features, rows.view.alive) - rows.target
     loss = value_coef * (rows.weight * error**2).sum() / (rows.weight.sum() + 1e-8)
     return loss, {"behaviour/critic_loss": loss}
 
 
 def update(
-    mappo: MAPPO,
+    state: ActorCritic,
     trajectory: Trajectory,
     key: PRNGKey,
     config: MAPPOConfig,
     replayed: ValueRows | None = None,
-) -> tuple[MAPPO, Metrics]:
+) -> tuple[ActorCritic, Metrics]:
     """`n_epochs` of minibatch PPO on one set of trajectories (Algorithm 1, lines 12-13).
 
     The critic learns from `replayed` rows too, all of them in every minibatch, if there are any.
     """
-    rows, metrics = experience(mappo.critic, trajectory, config)
+    rows, metrics = experience(state.critic, trajectory, config)
     n_rows = rows.target.shape[0]
     batch_size = min(config.batch_size, n_rows)
     n_batches = n_rows // batch_size
@@ -271,24 +301,24 @@ def update(
             loss, metrics = loss + real, metrics | {"behaviour/replay_critic_loss": real}
         return loss, metrics
 
-    def minibatch(mappo: MAPPO, index: Array) -> tuple[MAPPO, Metrics]:
+    def minibatch(state: ActorCritic, index: Array) -> tuple[ActorCritic, Metrics]:
         batch = jax.tree.map(lambda x: x[index], rows)
         actor_grad, actor_metrics = eqx.filter_grad(actor_loss, has_aux=True)(
-            mappo.actor, batch, mappo.ent_coef, config.clip
+            state.actor, batch, state.ent_coef, config.clip
         )
         critic_grad, critic_metrics = eqx.filter_grad(critic_objective, has_aux=True)(
-            mappo.critic, batch
+            state.critic, batch
         )
-        actor_step, actor_opt = actor_optimiser.update(actor_grad, mappo.actor_opt, mappo.actor)  # pyright: ignore[reportArgumentType]
-        critic_step, critic_opt = critic_optimiser.update(critic_grad, mappo.critic_opt)
-        mappo = MAPPO(
-            actor=eqx.apply_updates(mappo.actor, actor_step),
-            critic=eqx.apply_updates(mappo.critic, critic_step),
+        actor_step, actor_opt = actor_optimiser.update(actor_grad, state.actor_opt, state.actor)  # pyright: ignore[reportArgumentType]
+        critic_step, critic_opt = critic_optimiser.update(critic_grad, state.critic_opt)
+        state = ActorCritic(
+            actor=eqx.apply_updates(state.actor, actor_step),
+            critic=eqx.apply_updates(state.critic, critic_step),
             actor_opt=actor_opt,
             critic_opt=critic_opt,
-            ent_coef=mappo.ent_coef * config.ent_decay,
+            ent_coef=state.ent_coef * config.ent_decay,
         )
-        return mappo, actor_metrics | critic_metrics
+        return state, actor_metrics | critic_metrics
 
     def shuffled(key: PRNGKey) -> Array:
         order = jax.random.permutation(key, n_rows)[: n_batches * batch_size]
@@ -296,5 +326,5 @@ def update(
 
     batches = jax.vmap(shuffled)(jax.random.split(key, config.n_epochs))
     batches = rearrange(batches, "e m b -> (e m) b")
-    mappo, history = jax.lax.scan(minibatch, mappo, batches)
-    return mappo, metrics | jax.tree.map(jnp.mean, history) | {"behaviour/ent_coef": mappo.ent_coef}
+    state, history = jax.lax.scan(minibatch, state, batches)
+    return state, metrics | jax.tree.map(jnp.mean, history) | {"behaviour/ent_coef": state.ent_coef}

@@ -1,6 +1,6 @@
 """A run's folder: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP with config, versions, metrics, checkpoints.
 
-config.yaml      every field of the configuration
+config.yaml      every field of the configuration that the algorithm reads
 versions.yaml    package versions, git commit, machine
 metrics.jsonl    one JSON object a line, `step` in environment steps
 curves.png       refreshed during training
@@ -19,6 +19,7 @@ from pathlib import Path
 import yaml
 
 from mabl.algorithms.config import Config, from_dict
+from mabl.algorithms.registry import entry
 from mabl.errors import UserError
 
 RECORDED_PACKAGES = ("mabl", "jax", "jaxlib", "equinox", "optax", "orbax-checkpoint", "jaxmarl")
@@ -73,7 +74,9 @@ def read_config(folder: Path) -> Config:
 
 def write_config(folder: Path, config: Config) -> None:
     """Record a changed configuration, e.g. more steps after a resume."""
-    write_yaml(folder / "config.yaml", dataclasses.asdict(config))
+    unread = set(Config.sections()) - set(entry(config.algo).sections)
+    data = {name: x for name, x in dataclasses.asdict(config).items() if name not in unread}
+    write_yaml(folder / "config.yaml", data)
 
 
 def write_yaml(path: Path, data: dict) -> None:

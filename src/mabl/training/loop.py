@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from mabl import replay as replays
-from mabl.algorithms.model_based import Learner, ModelBased
+from mabl.algorithms.base import Algorithm, Experience
 from mabl.envs.base import CompiledEnv
+from mabl.execution import Executor, executor_of
 from mabl.replay import Replay
 from mabl.rollout import Collector, Rollout, rollout, start
 from mabl.types import Metrics, PRNGKey
@@ -18,7 +19,7 @@ from mabl.types import Metrics, PRNGKey
 class TrainState(NamedTuple):
     """Everything that decides the future of a run."""
 
-    learner: Learner
+    learner: Any
     replay: Replay
     collectors: Collector
     key: PRNGKey
@@ -30,14 +31,14 @@ class Training(NamedTuple):
     """An algorithm in an environment, ready to run."""
 
     env: CompiledEnv
-    algorithm: ModelBased
+    algorithm: Algorithm
 
     def init(self, key: PRNGKey) -> TrainState:
         """Line 1: initialise actor, critic, model and the model buffer."""
         config = self.algorithm.config.training
         key, key_learner, key_envs = jax.random.split(key, 3)
         learner = self.algorithm.init(key_learner)
-        executor = self.algorithm.executor(self.algorithm.policy(learner))
+        executor = self._executor(learner)
         collectors = jax.vmap(lambda key: start(self.env, executor, key))(
             jax.random.split(key_envs, config.num_envs)
         )
@@ -56,14 +57,15 @@ class Training(NamedTuple):
         key, key_collect, key_model, key_policy = jax.random.split(state.key, 4)
         collectors, collected = self.collect(state.learner, state.collectors, key_collect)
         replay = self.store(state.replay, collected)
+        experience = Experience(replay, state.collectors, collected)
         learner, model_metrics = repeat(
-            lambda learner, key: self.algorithm.update_model(learner, replay, key),
+            lambda learner, key: self.algorithm.update_model(learner, experience, key),
             state.learner,
             key_model,
             n_model,
         )
         learner, policy_metrics = repeat(
-            lambda learner, key: self.algorithm.update_policy(learner, replay, key),
+            lambda learner, key: self.algorithm.update_policy(learner, experience, key),
             learner,
             key_policy,
             n_policy,
@@ -79,22 +81,28 @@ class Training(NamedTuple):
         return state, model_metrics | policy_metrics | episode_sums(collected)
 
     def collect(
-        self, learner: Learner, collectors: Collector, key: PRNGKey
+        self, learner: Any, collectors: Collector, key: PRNGKey
     ) -> tuple[Collector, Rollout]:
-        """Line 3: act in every environment, for one episode or a fixed number of rows."""
+        """Line 3: act in every environment, for one episode or a fixed number of rows.
+
+        Rewards are scaled as learning wants them, sums over episodes are not.
+        """
         config = self.algorithm.config.training
-        executor = self.algorithm.executor(self.algorithm.policy(learner))
+        executor = self._executor(learner)
         one_episode = config.collect_steps is None
         n_rows = config.collect_steps or self.env.spec.episode_limit + 1
-        return jax.vmap(
+        collectors, collected = jax.vmap(
             lambda collector, key: rollout(self.env, executor, collector, key, n_rows, one_episode)
         )(collectors, jax.random.split(key, config.num_envs))
+        rows = collected.rows._replace(reward=collected.rows.reward * config.reward_scale)
+        return collectors, collected._replace(rows=rows)
+
+    def _executor(self, learner: Any) -> Executor:
+        return executor_of(self.algorithm.policy(learner), self.env.spec.action_space)
 
     def store(self, replay: Replay, collected: Rollout) -> Replay:
-        """Line 4: append the new rows, their rewards scaled."""
-        scale = self.algorithm.config.training.reward_scale
-        rows = collected.rows._replace(reward=collected.rows.reward * scale)
-        return jax.vmap(replays.add)(replay, rows, collected.count)
+        """Line 4: append the new rows."""
+        return jax.vmap(replays.add)(replay, collected.rows, collected.count)
 
 
 def steps_in(collected: Rollout) -> Int[Array, ""]:

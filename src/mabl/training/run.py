@@ -137,7 +137,7 @@ def _run(
     ):
         while step < total_steps and not interruption.requested:
             before, cycle_began = step, time.monotonic()
-            n_model, n_policy = updates_due(states, config)
+            n_model, n_policy = updates_due(states, training)
             if n_model and int(states.model_updates[0]) < config.training.pretrain_updates:
                 console.print(f"pretraining the model: {n_model} updates ...", highlight=False)
             states, metrics = program(states, n_model, n_policy)
@@ -178,11 +178,12 @@ def _run(
     return Outcome(folders, interruption.requested)
 
 
-def updates_due(states: TrainState, config: Config) -> tuple[int, int]:
+def updates_due(states: TrainState, training: Training) -> tuple[int, int]:
     """Model and policy updates of the next cycle: none in prefill, pretraining, then M and R."""
-    plan = config.training
+    plan = training.algorithm.config.training
     prefilled = int(states.env_steps.min()) >= plan.prefill_steps
-    if not prefilled or longest_lane(states) < config.world_model.batch_length:
+    known = longest_lane(states) + (plan.collect_steps or 0)
+    if not prefilled or known < training.algorithm.rows_needed:
         return 0, 0
     if int(states.model_updates[0]) < plan.pretrain_updates:
         return plan.pretrain_updates, 0

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import inf
-from typing import Any, ClassVar, Literal, Protocol, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -37,8 +37,8 @@ class WorldModelConfig:
     obs_weight: float = 1.0
     """Weight of the observations' loss."""
     reward_input: Literal["agent", "both"] = "agent"
-    """What imagination's reward predictor sees: (z_agent, h_agent) as in the paper, or both levels;
-    then the agent's own predictor is trained beside it."""
+    """What imagination's reward predictor sees: (z_agent, h_agent) as in the paper, or both levels,
+    where there are two; then the agent's own predictor is trained beside it."""
     reward_loss: Literal["huber", "mse"] = "huber"
     """Likelihood of the reward: smooth L1 with delta 1, or half the squared error."""
     reward_weight: float = 1.0
@@ -83,10 +83,11 @@ class WorldModelConfig:
 class WorldModel(Protocol[L]):
     """A latent-variable model of a team; one example, the caller vmaps over the batch.
 
-    `L` is the latent: a pytree whose leaves carry the agent axis.
+    `L` is the latent: a pytree of the whole team's.
     """
 
     filter: Any
+    """What execution needs of the model: a `LocalFilter` or a `JointFilter` (`execution.py`)."""
 
     def initial(self) -> L:
         """Latent before an episode's first row."""
@@ -96,8 +97,10 @@ class WorldModel(Protocol[L]):
         """What of a row does not depend on the past."""
         ...
 
-    def observe(self, latent: L, inputs: Any, key: PRNGKey) -> tuple[L, dict[str, Array]]:
-        """Posterior latent of the next row and its logits by level."""
+    def observe(
+        self, latent: L, inputs: Any, key: PRNGKey, train: bool = False
+    ) -> tuple[L, dict[str, Array]]:
+        """Posterior latent of the next row and its logits by level; dropout only to `train`."""
         ...
 
     def prior(self, latent: L, key: PRNGKey) -> tuple[L, dict[str, Array]]:
@@ -122,14 +125,14 @@ class WorldModel(Protocol[L]):
 
 
 def observe_sequence(
-    model: WorldModel[L], rows: TimeStep, key: PRNGKey
-) -> tuple[L, dict[str, Float[Array, "T N K C"]]]:
+    model: WorldModel[L], rows: TimeStep, key: PRNGKey, train: bool = False
+) -> tuple[L, dict[str, Float[Array, "T ..."]]]:
     """Posterior latents `[T, N, ...]` and logits of one sequence, from a zero latent."""
     inputs = jax.vmap(model.encode)(rows)
     keys = jax.random.split(key, rows.is_first.shape[0])
 
     def step(latent: L, at: tuple[Any, PRNGKey]) -> tuple[L, tuple[L, dict[str, Array]]]:
-        latent, logits = model.observe(latent, *at)
+        latent, logits = model.observe(latent, *at, train=train)
         return latent, (latent, logits)
 
     _, (latents, logits) = jax.lax.scan(step, model.initial(), (inputs, keys))
@@ -151,49 +154,71 @@ def model_loss(
     `config.overshooting` the decoders also see the latent that the prior predicts for each row from
     the row before (at a first row, from nothing): what imagination decodes and the KL alone trains.
     """
-    batch, length = rows.is_first.shape
-    key_observe, key_prior = jax.random.split(key)
-    latents, posterior = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
-        model, rows, jax.random.split(key_observe, batch)
-    )
-    keys_prior = jax.random.split(key_prior, (batch, length))
-    prior_latents, prior = jax.vmap(jax.vmap(model.prior))(latents, keys_prior)
-    predicted = jax.vmap(jax.vmap(model.predict))(latents)
-
+    observed = observe_batch(model, rows, key, train=True)
+    predicted = jax.vmap(jax.vmap(model.predict))(observed.latents)
     losses = decoder_losses(predicted, rows, config, action_space)
     if config.overshooting:
-        ahead = jax.vmap(jax.vmap(model.predict))(prior_latents)
+        ahead = jax.vmap(jax.vmap(model.predict))(observed.prior_latents)
         for name, loss in decoder_losses(ahead, rows, config, action_space).items():
             losses[f"ahead_{name}"] = config.overshooting * loss
-    for level in posterior:
-        losses[f"kl_{level}"] = (
-            config.kl_weight
-            * balanced_kl(
-                posterior[level],
-                prior[level],
-                config.kl_prior_weight,
-                config.kl_posterior_weight,
-                config.kl_reduction,
-                config.free_nats,
-            ).mean()
-        )
-    total = jnp.stack(list(losses.values())).sum()
-    metrics = {f"world_model/loss_{name}": value for name, value in losses.items()}
+    losses |= kl_losses(observed, config)
+    means = {name: loss.mean() for name, loss in losses.items()}
+    total = jnp.stack(list(means.values())).sum()
+    metrics = {f"world_model/loss_{name}": value for name, value in means.items()}
     metrics["world_model/loss"] = total
-    for level in posterior:
-        nats = categorical_kl(posterior[level], prior[level]).sum(-1).mean()
+    for level, posterior in observed.posterior.items():
+        nats = categorical_kl(posterior, observed.prior[level]).sum(-1).mean()
         metrics[f"world_model/kl_{level}"] = nats
     return total, metrics
 
 
+class Observed(NamedTuple):
+    """What a model makes of real sequences: `[B, T, ...]`."""
+
+    latents: Any
+    """Posterior latents."""
+    prior_latents: Any
+    """Prior latents of the same rows, from the rows before."""
+    posterior: dict[str, Float[Array, "B T *n K C"]]
+    prior: dict[str, Float[Array, "B T *n K C"]]
+
+
+def observe_batch(model: WorldModel, rows: TimeStep, key: PRNGKey, train: bool = False) -> Observed:
+    """Posteriors and priors of sequences `[B, T, ...]`."""
+    batch, length = rows.is_first.shape
+    key_observe, key_prior = jax.random.split(key)
+    latents, posterior = jax.vmap(lambda rows, key: observe_sequence(model, rows, key, train))(
+        rows, jax.random.split(key_observe, batch)
+    )
+    keys_prior = jax.random.split(key_prior, (batch, length))
+    prior_latents, prior = jax.vmap(jax.vmap(model.prior))(latents, keys_prior)
+    return Observed(latents, prior_latents, posterior, prior)
+
+
+def kl_losses(observed: Observed, config: WorldModelConfig) -> dict[str, Float[Array, "B T *n"]]:
+    """Balanced and weighted KL of each level."""
+    return {
+        f"kl_{level}": config.kl_weight
+        * balanced_kl(
+            posterior,
+            observed.prior[level],
+            config.kl_prior_weight,
+            config.kl_posterior_weight,
+            config.kl_reduction,
+            config.free_nats,
+        )
+        for level, posterior in observed.posterior.items()
+    }
+
+
 def decoder_losses(
     predicted: Predictions, rows: TimeStep, config: WorldModelConfig, action_space: ActionSpace
-) -> dict[str, Float[Array, ""]]:
+) -> dict[str, Float[Array, "B T N"]]:
     """-log likelihoods of rows `[B, T, ...]` under what is decoded from their latents, weighted.
 
     -log p(o^i | z^a, h^a), -log p(r^i | z^a, h^a), and -log p(. | z^a, z^g, h^a, h^g) of
-    termination, availability and the action a^i_{t-1} (sections 3.1.2 and 3.2).
-    Observations and actions of dead agents do not count, nor does the action before a first row.
+    termination, availability and the action a^i_{t-1} (sections 3.1.2 and 3.2), and of life
+    (ADR 9). Observations and actions of the dead do not count, nor the action before a first row.
     """
     alive = rows.alive.astype(jnp.float32)
     acted = alive * ~rows.is_first[..., None]
@@ -207,14 +232,15 @@ def decoder_losses(
         "available": optax.sigmoid_binary_cross_entropy(
             predicted.available, rows.available.astype(jnp.float32)
         ).sum(-1),
+        "alive": optax.sigmoid_binary_cross_entropy(predicted.alive, alive),
         "action": acted * action_loss(predicted.action, rows.prev_action, action_space),
     }
-    if config.reward_input == "both":
+    if predicted.agent_reward is not None:
         weight = config.agent_reward_weight * config.reward_weight
         losses["agent_reward"] = weight * reward_loss(
             predicted.agent_reward, rows.reward, config.reward_loss
         )
-    return {name: loss.mean() for name, loss in losses.items()}
+    return losses
 
 
 def reward_loss(

@@ -16,12 +16,14 @@ class Predictions(NamedTuple):
     obs: Float[Array, "*b O"]
     reward: Float[Array, "*b"]
     """What imagination uses."""
-    agent_reward: Float[Array, "*b"]
-    """From the agent level alone; the same number where that is what imagination uses."""
+    agent_reward: Float[Array, "*b"] | None
+    """From the agent level alone, where imagination uses more than that."""
     terminated: Float[Array, "*b"]
     """Logit of p(terminated)."""
     available: Float[Array, "*b A"]
     """Logits of p(available), one Bernoulli for each action."""
+    alive: Float[Array, "*b"]
+    """Logit of p(alive)."""
     action: Float[Array, "*b A"]
     """The agent's own previous action: logits if discrete, mean if continuous."""
 
@@ -29,7 +31,8 @@ class Predictions(NamedTuple):
 class Heads(eqx.Module):
     """The decoders of one agent, of `n_hidden` hidden layers each (Table 2: two).
 
-    With `both_levels_reward` a second reward predictor sees both levels; ADR 4 says why.
+    With `both_levels_reward` a second reward predictor sees both levels; ADR 4 says why. Life comes
+    from the decoder of availability, as one Bernoulli more (ADR 9).
     """
 
     obs: MLP
@@ -54,7 +57,7 @@ class Heads(eqx.Module):
         self.obs = MLP(agent_dim, obs_dim, hidden, n_hidden, keys[0])
         self.agent_reward = MLP(agent_dim, 1, hidden, n_hidden, keys[1])
         self.terminated = MLP(full_dim, 1, hidden, n_hidden, keys[2])
-        self.available = MLP(full_dim, action_dim, hidden, n_hidden, keys[3])
+        self.available = MLP(full_dim, action_dim + 1, hidden, n_hidden, keys[3])
         self.action = MLP(full_dim, action_dim, hidden, n_hidden, keys[4])
         self.full_reward = (
             MLP(full_dim, 1, hidden, n_hidden, keys[5]) if both_levels_reward else None
@@ -63,11 +66,13 @@ class Heads(eqx.Module):
     def __call__(self, agent: Float[Array, " F"], full: Float[Array, " G"]) -> Predictions:
         """Decode one agent's latents: its own level, and all levels."""
         agent_reward = self.agent_reward(agent)[0]
+        available = self.available(full)
         return Predictions(
             obs=self.obs(agent),
             reward=self.full_reward(full)[0] if self.full_reward else agent_reward,
-            agent_reward=agent_reward,
+            agent_reward=agent_reward if self.full_reward else None,
             terminated=self.terminated(full)[0],
-            available=self.available(full),
+            available=available[:-1],
+            alive=available[-1],
             action=self.action(full),
         )

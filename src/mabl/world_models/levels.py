@@ -1,15 +1,17 @@
 """The parts that one level of a latent-variable model is made of (section 3.1.1)."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mabl.nets.categorical import flatten, sample_straight_through, unflatten
 from mabl.nets.mlp import MLP, Linear
 from mabl.types import PRNGKey
+
+Tree = TypeVar("Tree")
 
 
 class Level(NamedTuple):
@@ -17,6 +19,10 @@ class Level(NamedTuple):
 
     h: Float[Array, "*b D"]
     z: Float[Array, "*b KC"]
+
+    def features(self) -> Float[Array, "*b F"]:
+        """(z, h), as networks see them."""
+        return jnp.concatenate([self.z, self.h], axis=-1)
 
 
 class Recurrent(eqx.Module):
@@ -56,6 +62,16 @@ def draw(logits: Float[Array, "*b K C"], key: PRNGKey) -> Float[Array, "*b KC"]:
     return flatten(sample_straight_through(logits, key))
 
 
+def team_of(n_agents: int, own: Tree) -> Tree:
+    """One agent's arrays, repeated along a new axis of agents."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (n_agents, *x.shape)), own)
+
+
+def forget(past: Tree, is_first: Bool[Array, ""]) -> Tree:
+    """Zeros at an episode's first row, else the past as it is."""
+    return jax.tree.map(lambda x: jnp.where(is_first, jnp.zeros_like(x), x), past)
+
+
 class AgentFilter(eqx.Module):
     """What an agent runs to know where it is: from its own observations and actions alone.
 
@@ -66,6 +82,7 @@ class AgentFilter(eqx.Module):
     encoder: MLP
     recurrent: Recurrent
     posterior: Categoricals
+    obs_dim: int = eqx.field(static=True)
     latent_dim: int = eqx.field(static=True)
     hidden: int = eqx.field(static=True)
 
@@ -79,6 +96,7 @@ class AgentFilter(eqx.Module):
         key: PRNGKey,
     ):
         key_encoder, key_recurrent, key_posterior = jax.random.split(key, 3)
+        self.obs_dim = obs_dim
         self.latent_dim = n_categoricals * n_classes
         self.hidden = hidden
         self.encoder = MLP(obs_dim, hidden, hidden, 2, key_encoder)
@@ -106,3 +124,7 @@ class AgentFilter(eqx.Module):
     ) -> Level:
         """One step of execution; the caller resets `level` and `prev_action` at a first row."""
         return self.infer(level, prev_action, self.embed(obs), key)[0]
+
+    def features(self, level: Level) -> Float[Array, " F"]:
+        """(z_t, h_t): what the policy sees."""
+        return level.features()

@@ -1,100 +1,56 @@
 """MABL's bi-level world model (section 3.1): written for agent i, then vmapped over agents."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mabl.envs.base import EnvSpec
-from mabl.nets.mlp import MLP
 from mabl.types import PRNGKey, TimeStep
 from mabl.world_models.base import WorldModelConfig
-from mabl.world_models.heads import Heads, Predictions
-from mabl.world_models.levels import AgentFilter, Categoricals, Level, Recurrent, draw
-
-
-class Latent(NamedTuple):
-    """Both levels of every agent `[N, ...]`, or of one inside the per-agent functions."""
-
-    agent: Level
-    global_: Level
-
-
-class Inputs(NamedTuple):
-    """A row as the scan over time needs it: all that does not recur is computed beforehand."""
-
-    prev_action: Float[Array, "N A"]
-    obs: Float[Array, "N D"]
-    state: Float[Array, " D"]
-    is_first: Array
+from mabl.world_models.bilevel import BiLevel, Inputs, Latent
+from mabl.world_models.heads import Predictions
+from mabl.world_models.levels import AgentFilter, Level, draw, forget, team_of
 
 
 class MABL(eqx.Module):
-    """Bi-level latent-variable world model; parameters shared by all agents."""
+    """Bi-level latent-variable world model; parameters shared by all agents.
 
-    filter: AgentFilter
-    state_encoder: MLP
-    global_recurrent: Recurrent
-    global_posterior: Categoricals
-    global_prior: Categoricals
-    agent_prior: Categoricals
-    heads: Heads
+    Each agent has a global latent of its own: both levels of a `Latent` are `[N, ...]`, or of one
+    agent inside the per-agent functions.
+    """
+
+    nets: BiLevel
     spec: EnvSpec = eqx.field(static=True)
     config: WorldModelConfig = eqx.field(static=True)
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
-        keys = jax.random.split(key, 7)
-        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
-        latent_dim, action_dim = k * c, spec.action_space.size
-        level_dim = hidden + latent_dim
         self.spec, self.config = spec, config
-        self.filter = AgentFilter(spec.obs_dim, action_dim, hidden, k, c, keys[0])
-        self.state_encoder = MLP(spec.state_dim, hidden, hidden, 2, keys[1])
-        self.global_recurrent = Recurrent(latent_dim, spec.n_agents * action_dim, hidden, keys[2])
-        self.global_posterior = Categoricals(2 * hidden + latent_dim, hidden, k, c, keys[3])
-        self.global_prior = Categoricals(hidden, hidden, k, c, keys[4])
-        self.agent_prior = Categoricals(hidden + latent_dim, hidden, k, c, keys[5])
-        self.heads = Heads(
-            agent_dim=level_dim,
-            full_dim=2 * level_dim,
-            obs_dim=spec.obs_dim,
-            action_dim=action_dim,
-            hidden=hidden,
-            n_hidden=config.n_hidden,
-            both_levels_reward=config.reward_input == "both",
-            key=keys[6],
-        )
+        self.nets = BiLevel(spec, config, 1, key)
+
+    @property
+    def filter(self) -> AgentFilter:
+        """The agent level's posterior: all of the model that execution needs."""
+        return self.nets.filter
 
     def initial(self) -> Latent:
         """The team's latent before an episode's first row: zeros."""
-        level = jax.tree.map(
-            lambda x: jnp.zeros((self.spec.n_agents, *x.shape)), self.filter.initial()
-        )
+        level = team_of(self.spec.n_agents, self.filter.initial())
         return Latent(agent=level, global_=level)
 
     def encode(self, row: TimeStep) -> Inputs:
         """Encode actions, observations and the state of one row."""
-        return Inputs(
-            prev_action=self.spec.action_space.encode(row.prev_action),
-            obs=jax.vmap(self.filter.embed)(row.obs),
-            state=jax.nn.relu(self.state_encoder(row.state)),
-            is_first=row.is_first,
-        )
+        return self.nets.encode(row, self.spec)
 
     def observe(
-        self, latent: Latent, inputs: Inputs, key: PRNGKey
+        self, latent: Latent, inputs: Inputs, key: PRNGKey, train: bool = False
     ) -> tuple[Latent, dict[str, Float[Array, "N K C"]]]:
         """Posterior latents of the next row, and their logits by level (representation model).
 
         h^a_t = f(h^a_{t-1}, z^a_{t-1}, a^i_{t-1}),   z^a_t ~ q(z^a_t | o^i_t, h^a_t)
         h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^a_t, h^g_t)
         """
-        latent, prev_action = jax.tree.map(
-            lambda x: jnp.where(inputs.is_first, jnp.zeros_like(x), x),
-            (latent, inputs.prev_action),
-        )
+        latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
         joint_action = prev_action.ravel()
 
         def observe_agent(
@@ -102,8 +58,8 @@ class MABL(eqx.Module):
         ) -> tuple[Latent, dict[str, Array]]:
             key_agent, key_global = jax.random.split(key)
             agent, agent_logits = self.filter.infer(latent.agent, prev_action, obs, key_agent)
-            h = self.global_recurrent(latent.global_, joint_action)
-            global_logits = self.global_posterior(inputs.state, agent.z, h)
+            h = self.nets.global_recurrent(latent.global_, joint_action)
+            global_logits = self.nets.global_posterior(inputs.state, agent.z, h)
             global_ = Level(h, draw(global_logits, key_global))
             return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
 
@@ -135,7 +91,7 @@ class MABL(eqx.Module):
 
         def imagine_agent(latent: Latent, action: Array, key: PRNGKey) -> Latent:
             h_agent = self.filter.recurrent(latent.agent, action)
-            h_global = self.global_recurrent(latent.global_, joint_action)
+            h_global = self.nets.global_recurrent(latent.global_, joint_action)
             return self._transition(h_agent, h_global, key)[0]
 
         keys = jax.random.split(key, self.spec.n_agents)
@@ -155,9 +111,9 @@ class MABL(eqx.Module):
         The agent's prior sees `z_global` if given, else the global sample.
         """
         key_agent, key_global = jax.random.split(key)
-        global_logits = self.global_prior(h_global)
+        global_logits = self.nets.global_prior(h_global)
         sample = draw(global_logits, key_global)
-        agent_logits = self.agent_prior(h_agent, sample if z_global is None else z_global)
+        agent_logits = self.nets.agent_prior(h_agent, sample if z_global is None else z_global)
         agent = Level(h_agent, draw(agent_logits, key_agent))
         return Latent(agent, Level(h_global, sample)), {
             "agent": agent_logits,
@@ -170,14 +126,18 @@ class MABL(eqx.Module):
         o^i_t from (z^a, h^a); r^i_t likewise (`config.reward_input`); termination, availability and
         a^i_{t-1} from both levels.
         """
-        return jax.vmap(self.heads)(self.actor_features(latent), self.critic_features(latent))
+        return jax.vmap(self.nets.heads)(self.actor_features(latent), self.critic_features(latent))
 
     def actor_features(self, latent: Latent) -> Float[Array, "N F"]:
         """(z^a, h^a): all that a policy may see (section 3.3)."""
-        return jnp.concatenate([latent.agent.z, latent.agent.h], axis=-1)
+        return latent.agent.features()
 
     def critic_features(self, latent: Latent) -> Float[Array, "N G"]:
         """(z^a, z^g, h^a, h^g): the centralised critic's input."""
         return jnp.concatenate(
             [latent.agent.z, latent.global_.z, latent.agent.h, latent.global_.h], axis=-1
         )
+
+    def global_features(self, latent: Latent) -> Float[Array, "N KC"]:
+        """z^g: what QMIX's mixer sees (section 3.3)."""
+        return latent.global_.z

@@ -1,0 +1,216 @@
+"""MAPPO without a world model [46]: recurrent policies, learned on the newest real rows alone."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from einops import rearrange
+from jaxtyping import Array
+
+from mabl.algorithms.base import Experience
+from mabl.algorithms.config import Config
+from mabl.behaviour.actor import Actor
+from mabl.behaviour.critic import Critic
+from mabl.behaviour.mappo import PPORows
+from mabl.behaviour.recurrent import (
+    Chunks,
+    RecurrentFilter,
+    policies,
+    recurrent_policy_loss,
+    value_loss,
+)
+from mabl.envs.base import EnvSpec
+from mabl.errors import UserError
+from mabl.execution import Policy
+from mabl.losses.returns import lambda_returns
+from mabl.nets.normaliser import Normaliser
+from mabl.replay import Replay
+from mabl.types import Metrics, PRNGKey, TeamView, TimeStep, is_last
+
+
+class PolicyLearner(NamedTuple):
+    """All that learning changes."""
+
+    policy: Policy
+    critic: Critic
+    policy_opt: optax.OptState
+    critic_opt: optax.OptState
+    returns: Normaliser
+
+
+@dataclass(frozen=True)
+class ModelFree:
+    """Recurrent MAPPO on real episodes; each update sees the rows of one cycle only.
+
+    Raises UserError for rows of a cycle that do not divide into chunks.
+    """
+
+    spec: EnvSpec
+    config: Config
+
+    def __post_init__(self) -> None:
+        rows, length = self.config.training.collect_steps, self.config.recurrent_mappo.chunk_length
+        if rows is None or rows % length:
+            raise UserError(
+                f"--training.collect-steps is {rows}: give a multiple of the {length} rows of "
+                "--recurrent-mappo.chunk-length"
+            )
+
+    @property
+    def rows_needed(self) -> int:
+        """Whatever a cycle collects."""
+        return 1
+
+    def init(self, key: PRNGKey) -> PolicyLearner:
+        """Fresh parameters and optimisers."""
+        config, spec = self.config.recurrent_mappo, self.spec
+        key_filter, key_actor, key_critic = jax.random.split(key, 3)
+        policy = Policy(
+            RecurrentFilter(spec.obs_dim, config.hidden, key_filter),
+            Actor(
+                config.hidden,
+                spec.action_space.size,
+                config.hidden,
+                0,
+                config.actor_out_scale,
+                key_actor,
+            ),
+        )
+        n_critic = spec.obs_dim + spec.state_dim
+        critic = Critic(n_critic, config.hidden, 1, config.n_heads, key_critic)
+        optimiser = self._optimiser()
+        return PolicyLearner(
+            policy,
+            critic,
+            optimiser.init(eqx.filter(policy, eqx.is_array)),
+            optimiser.init(eqx.filter(critic, eqx.is_array)),
+            Normaliser.fresh(),
+        )
+
+    def policy(self, learner: PolicyLearner) -> Policy:
+        """The recurrent policy."""
+        return learner.policy
+
+    def update_model(
+        self, learner: PolicyLearner, experience: Experience, key: PRNGKey
+    ) -> tuple[PolicyLearner, Metrics]:
+        """There is no model."""
+        del experience, key
+        return learner, {}
+
+    def update_policy(
+        self, learner: PolicyLearner, experience: Experience, key: PRNGKey
+    ) -> tuple[PolicyLearner, Metrics]:
+        """`n_epochs` of minibatch PPO on the rows that the present policy has just collected."""
+        config = self.config.recurrent_mappo
+        chunks, metrics = self.chunks(learner, experience)
+        n_chunks = chunks.memory.shape[0]
+        targets, weights = chunks.rows.target, chunks.rows.weight
+        learner = learner._replace(
+            returns=learner.returns.update(targets, weights, config.value_decay)
+        )
+        size = max(n_chunks // config.n_minibatches, 1)
+        optimiser = self._optimiser()
+
+        def minibatch(learner: PolicyLearner, index: Array) -> tuple[PolicyLearner, Metrics]:
+            batch = jax.tree.map(lambda x: x[index], chunks)
+            policy_grad, policy_metrics = eqx.filter_grad(recurrent_policy_loss, has_aux=True)(
+                learner.policy, batch, jnp.float32(config.ent_coef), config.clip
+            )
+            critic_grad, critic_metrics = eqx.filter_grad(value_loss, has_aux=True)(
+                learner.critic, batch.rows, learner.returns, config.value_coef
+            )
+            policy_step, policy_opt = optimiser.update(policy_grad, learner.policy_opt)
+            critic_step, critic_opt = optimiser.update(critic_grad, learner.critic_opt)
+            learner = learner._replace(
+                policy=eqx.apply_updates(learner.policy, policy_step),
+                critic=eqx.apply_updates(learner.critic, critic_step),
+                policy_opt=policy_opt,
+                critic_opt=critic_opt,
+            )
+            return learner, policy_metrics | critic_metrics
+
+        def shuffled(key: PRNGKey) -> Array:
+            order = jax.random.permutation(key, n_chunks)[: n_chunks // size * size]
+            return rearrange(order, "(m b) -> m b", b=size)
+
+        batches = jax.vmap(shuffled)(jax.random.split(key, config.n_epochs))
+        learner, history = jax.lax.scan(minibatch, learner, rearrange(batches, "e m b -> (e m) b"))
+        return learner, metrics | jax.tree.map(jnp.mean, history)
+
+    def chunks(self, learner: PolicyLearner, experience: Experience) -> tuple[Chunks, Metrics]:
+        """The newest rows with their memories, log-probabilities, returns and advantages.
+
+        Rows start with the one at which the first new action was chosen. From an episode's last row
+        to the next reset nothing passes: that step weighs nothing and hands back the last row's
+        value, so that truncated episodes bootstrap.
+        """
+        config = self.config.recurrent_mappo
+        rows = jax.tree.map(
+            lambda row, rows: jnp.concatenate([row[:, None], rows], axis=1),
+            experience.before.row,
+            experience.newest.rows,
+        )
+        unroll = jax.vmap(learner.policy.filter.unroll, in_axes=(0, 1, None), out_axes=1)
+        before, after = jax.vmap(unroll)(experience.before.memory, rows.obs, rows.is_first)
+        view = TeamView(after, critic_features(rows), rows.available, rows.alive)
+        value = jax.vmap(jax.vmap(learner.critic))(view.critic_features, view.alive)
+        value = learner.returns.restore(value)
+        ends = is_last(rows)[:, :-1, None]
+        reward = rows.reward[:, 1:]
+        if config.team_reward:
+            reward = jnp.broadcast_to(reward.mean(-1, keepdims=True), reward.shape)
+        reward = jnp.where(ends, value[:, :-1], reward)
+        discount = config.gamma * (1.0 - (rows.terminated[:, 1:] | ends))
+        target = jax.vmap(lambda_returns, in_axes=(0, 0, 0, None))(
+            reward, discount, value[:, 1:], config.gae_lambda
+        )
+        weight = jnp.broadcast_to(1.0 - ends, target.shape)
+        advantage = target - value[:, :-1]
+        counted = weight * rows.alive[:, :-1]
+        mean = (counted * advantage).sum() / counted.sum()
+        std = jnp.sqrt((counted * (advantage - mean) ** 2).sum() / counted.sum())
+        view = jax.tree.map(lambda x: x[:, :-1], view)
+        policy = policies(learner.policy.filter, learner.policy.actor, view)
+        action = rows.prev_action[:, 1:]
+        ppo = PPORows(
+            view, action, policy.log_prob(action), (advantage - mean) / (std + 1e-5), target, weight
+        )
+        length = config.chunk_length
+
+        def cut(x: Array) -> Array:
+            return rearrange(x, "e (c l) ... -> (e c) l ...", l=length)
+
+        chunks = Chunks(
+            memory=cut(before[:, :-1])[:, 0],
+            obs=cut(rows.obs[:, :-1]),
+            is_first=cut(rows.is_first[:, :-1]),
+            rows=jax.tree.map(cut, ppo),
+        )
+        metrics = {
+            "behaviour/value": (weight * value[:, :-1]).sum() / weight.sum(),
+            "behaviour/return": (weight * target).sum() / weight.sum(),
+            "behaviour/advantage_std": std,
+        }
+        return chunks, metrics
+
+    def diagnose(self, learner: PolicyLearner, replay: Replay, key: PRNGKey) -> Metrics:
+        """Nothing: there is no model."""
+        del learner, replay, key
+        return {}
+
+    def _optimiser(self) -> optax.GradientTransformation:
+        config = self.config.recurrent_mappo
+        return optax.chain(
+            optax.clip_by_global_norm(config.grad_clip),
+            optax.adam(config.learning_rate, eps=1e-5),
+        )
+
+
+def critic_features(rows: TimeStep) -> Array:
+    """The state beside each agent's observation: `[*b, N, O + S]`."""
+    state = jnp.broadcast_to(rows.state[..., None, :], (*rows.obs.shape[:-1], rows.state.shape[-1]))
+    return jnp.concatenate([rows.obs, state], axis=-1)

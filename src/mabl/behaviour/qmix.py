@@ -1,0 +1,255 @@
+"""QMIX on latents [31]: the paper's value-based way to learn in imagination (section 3.3)."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from einops import rearrange
+from jaxtyping import Array, Bool, Float, Int
+
+from mabl.behaviour.actor import MaskedCategorical
+from mabl.errors import require_between, require_positive
+from mabl.losses.returns import lambda_returns
+from mabl.nets.mlp import MLP
+from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
+
+
+@dataclass(frozen=True)
+class QMIXConfig:
+    """Agents' values, their mixer, and how they are learned. Sizes are the paper's MAPPO's."""
+
+    FLAG_PREFIX: ClassVar[str] = "qmix."
+
+    hidden: int = 256
+    """Width of the agents' value network."""
+    n_hidden: int = 2
+    """Hidden layers of the agents' value network."""
+    mixer_hidden: int = 32
+    """Width of the mixer."""
+    hypernet_hidden: int = 64
+    """Width of the networks that make the mixer's weights."""
+    learning_rate: float = 5e-4
+    """Adam's learning rate."""
+    grad_clip: float = 10.0
+    """Largest global norm of the gradient."""
+    gamma: float = 0.99
+    """Discount factor."""
+    td_lambda: float = 0.6
+    """Lambda of the returns that values are regressed on; 0: one-step targets."""
+    target_rate: float = 0.01
+    """How far target networks move towards the learned ones after each minibatch."""
+    n_epochs: int = 5
+    """Passes over the imagined rows in one policy update."""
+    batch_size: int = 2000
+    """Joint rows in a minibatch."""
+    epsilon_start: float = 1.0
+    """Probability of a random action at the start."""
+    epsilon_end: float = 0.05
+    """Probability of a random action at the end."""
+    epsilon_updates: int = 2000
+    """Policy updates over which it falls."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "hidden", "n_hidden", "mixer_hidden", "hypernet_hidden")
+        require_positive(self, "learning_rate", "grad_clip", "n_epochs", "batch_size")
+        require_positive(self, "epsilon_updates")
+        require_between(self, 0, 1, "gamma", "td_lambda", "target_rate")
+        require_between(self, 0, 1, "epsilon_start", "epsilon_end")
+
+
+class EpsilonGreedy(eqx.Module):
+    """Agent i's policy: the best action of Q_i(z_agent, h_agent), or with epsilon any available."""
+
+    q: MLP
+    epsilon: Float[Array, ""]
+
+    def __call__(
+        self, features: Float[Array, " F"], available: Bool[Array, " A"]
+    ) -> MaskedCategorical:
+        """The policy at one agent's features; where nothing is available, everything is."""
+        may = available | ~available.any()
+        best = jax.nn.one_hot(jnp.where(may, self.q(features), -jnp.inf).argmax(), may.shape[0])
+        probs = (1 - self.epsilon) * best + self.epsilon * may / may.sum()
+        return MaskedCategorical.of(jnp.log(jnp.maximum(probs, 1e-20)), available)
+
+
+class Mixer(eqx.Module):
+    """Q_tot(Q_1 .. Q_N, z^{g,1} .. z^{g,N}), which never falls when a Q_i rises.
+
+    Two layers whose weights networks compute from the global latents; weights on the Q_i and on
+    what is made of them are made positive by their absolute values.
+    """
+
+    weight_in: MLP
+    bias_in: MLP
+    weight_out: MLP
+    bias_out: MLP
+
+    def __init__(self, n_agents: int, n_features: int, hidden: int, hypernet: int, key: PRNGKey):
+        keys = jax.random.split(key, 4)
+        self.weight_in = MLP(n_features, n_agents * hidden, hypernet, 1, keys[0])
+        self.bias_in = MLP(n_features, hidden, hypernet, 0, keys[1])
+        self.weight_out = MLP(n_features, hidden, hypernet, 1, keys[2])
+        self.bias_out = MLP(n_features, 1, hypernet, 1, keys[3])
+
+    def __call__(self, q: Float[Array, " N"], features: Float[Array, "N G"]) -> Float[Array, ""]:
+        """The team's value of the agents' values `q`."""
+        seen = features.ravel()
+        weight = rearrange(jnp.abs(self.weight_in(seen)), "(n e) -> n e", n=q.shape[0])
+        hidden = jax.nn.elu(q @ weight + self.bias_in(seen))
+        return hidden @ jnp.abs(self.weight_out(seen)) + self.bias_out(seen)[0]
+
+
+class Values(NamedTuple):
+    """The networks that target networks copy."""
+
+    q: MLP
+    mixer: Mixer
+
+    def chosen(self, view: TeamView, action: Int[Array, " N"]) -> Float[Array, ""]:
+        """Q_tot of a joint action."""
+        q = jnp.take_along_axis(self.agents(view), action[:, None], axis=-1)[:, 0]
+        return self.mixer(q, view.critic_features)
+
+    def agents(self, view: TeamView) -> Float[Array, "N A"]:
+        """Every Q_i."""
+        return jax.vmap(self.q)(view.actor_features)
+
+    def best(self, view: TeamView) -> Int[Array, " N"]:
+        """The available action with the highest Q_i, for each agent."""
+        may = view.available | ~view.available.any(-1, keepdims=True)
+        return jnp.where(may, self.agents(view), -jnp.inf).argmax(-1)
+
+
+class QState(NamedTuple):
+    """Everything that learning to act changes."""
+
+    values: Values
+    target: Values
+    opt: optax.OptState
+    epsilon: Float[Array, ""]
+
+
+class QRows(NamedTuple):
+    """Joint rows of imagined experience `[M, ...]`; targets and weights are the team's."""
+
+    view: TeamView
+    action: Array
+    target: Float[Array, " M"]
+    weight: Float[Array, " M"]
+
+
+class QMIX(NamedTuple):
+    """Values of each agent, mixed monotonically by what the global latents know."""
+
+    config: QMIXConfig
+
+    def init(self, view: TeamView, n_actions: int, key: PRNGKey) -> QState:
+        """Fresh networks for features of the view's sizes."""
+        config = self.config
+        key_q, key_mixer = jax.random.split(key)
+        n_agents, n_features = view.critic_features.shape
+        values = Values(
+            MLP(view.actor_features.shape[-1], n_actions, config.hidden, config.n_hidden, key_q),
+            Mixer(
+                n_agents,
+                n_agents * n_features,
+                config.mixer_hidden,
+                config.hypernet_hidden,
+                key_mixer,
+            ),
+        )
+        target = jax.tree.map(jnp.copy, values)
+        opt = optimiser(config).init(eqx.filter(values, eqx.is_array))
+        return QState(values, target, opt, jnp.float32(config.epsilon_start))
+
+    def actor(self, state: QState) -> EpsilonGreedy:
+        """Epsilon-greedy; its mode is greedy."""
+        return EpsilonGreedy(state.values.q, state.epsilon)
+
+    def critic_features(self, model: Any, latent: Any) -> Float[Array, "N G"]:
+        """z_global of every agent, for the mixer."""
+        return model.global_features(latent)
+
+    def value(self, state: QState, view: TeamView) -> Float[Array, " N"]:
+        """Q_tot of the best joint action, for everybody."""
+        total = state.values.chosen(view, state.values.best(view))
+        return jnp.broadcast_to(total, view.alive.shape)
+
+    def update(
+        self, state: QState, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
+    ) -> tuple[QState, Metrics]:
+        """`n_epochs` of minibatch regression on one set of trajectories; epsilon falls a step."""
+        del replayed
+        config = self.config
+        rows, metrics = experience(state, trajectory, config)
+        n_rows = rows.target.shape[0]
+        batch_size = min(config.batch_size, n_rows)
+        n_batches = n_rows // batch_size
+
+        def minibatch(state: QState, index: Array) -> tuple[QState, Metrics]:
+            batch = jax.tree.map(lambda x: x[index], rows)
+            gradient, metrics = eqx.filter_grad(td_loss, has_aux=True)(state.values, batch)
+            step, opt = optimiser(config).update(gradient, state.opt)
+            values = eqx.apply_updates(state.values, step)
+            target = jax.tree.map(
+                lambda new, old: old + config.target_rate * (new - old), values, state.target
+            )
+            return QState(values, target, opt, state.epsilon), metrics
+
+        def shuffled(key: PRNGKey) -> Array:
+            order = jax.random.permutation(key, n_rows)[: n_batches * batch_size]
+            return rearrange(order, "(m b) -> m b", m=n_batches)
+
+        batches = jax.vmap(shuffled)(jax.random.split(key, config.n_epochs))
+        state, history = jax.lax.scan(minibatch, state, rearrange(batches, "e m b -> (e m) b"))
+        fall = (config.epsilon_start - config.epsilon_end) / config.epsilon_updates
+        epsilon = jnp.maximum(state.epsilon - fall, config.epsilon_end)
+        metrics |= jax.tree.map(jnp.mean, history) | {"behaviour/epsilon": epsilon}
+        return state._replace(epsilon=epsilon), metrics
+
+
+def optimiser(config: QMIXConfig) -> optax.GradientTransformation:
+    """Adam behind gradient clipping."""
+    return optax.chain(
+        optax.clip_by_global_norm(config.grad_clip), optax.adam(config.learning_rate)
+    )
+
+
+def experience(state: QState, trajectory: Trajectory, config: QMIXConfig) -> tuple[QRows, Metrics]:
+    """Double-Q targets of trajectories, flattened to joint rows.
+
+    y_t = r_t+1 + gamma c_t+1 ((1 - lambda) Q_tot^-(t+1, argmax Q_i) + lambda y_t+1); rewards and
+    the model's probabilities to go on are the team's mean.
+    """
+
+    def next_value(view: TeamView) -> Float[Array, ""]:
+        return state.target.chosen(view, state.values.best(view))
+
+    ahead = jax.tree.map(lambda x: x[1:], trajectory.view)
+    reward, weight = trajectory.reward.mean(-1), trajectory.weight.mean(-1)
+    target = lambda_returns(
+        reward,
+        config.gamma * trajectory.continues.mean(-1),
+        jax.vmap(jax.vmap(next_value))(ahead),
+        config.td_lambda,
+    )
+    view = jax.tree.map(lambda x: x[:-1], trajectory.view)
+    rows = QRows(view, trajectory.action, target, weight)
+    total = weight.sum() + 1e-8
+    metrics = {
+        "behaviour/imagined_reward": (weight * reward).sum() / total,
+        "behaviour/imagined_return": (weight[0] * target[0]).sum() / (weight[0].sum() + 1e-8),
+        "behaviour/value": (weight * target).sum() / total,
+    }
+    return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
+
+
+def td_loss(values: Values, rows: QRows) -> tuple[Float[Array, ""], Metrics]:
+    """Half the squared error of Q_tot to its targets."""
+    error = jax.vmap(values.chosen)(rows.view, rows.action) - rows.target
+    loss = 0.5 * (rows.weight * error**2).sum() / (rows.weight.sum() + 1e-8)
+    return loss, {"behaviour/critic_loss": loss}

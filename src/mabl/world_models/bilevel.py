@@ -1,0 +1,76 @@
+"""What MABL and MABL-SG are both made of: the networks of two levels, and a row as they see it."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Bool, Float
+
+from mabl.envs.base import EnvSpec
+from mabl.nets.mlp import MLP
+from mabl.types import PRNGKey, TimeStep
+from mabl.world_models.base import WorldModelConfig
+from mabl.world_models.heads import Heads
+from mabl.world_models.levels import AgentFilter, Categoricals, Level, Recurrent
+
+
+class Latent(NamedTuple):
+    """Both levels; whose they are, the model says."""
+
+    agent: Level
+    global_: Level
+
+
+class Inputs(NamedTuple):
+    """A row as the scan over time needs it: all that does not recur is computed beforehand."""
+
+    prev_action: Float[Array, "N A"]
+    obs: Float[Array, "N D"]
+    state: Float[Array, " D"]
+    is_first: Bool[Array, ""]
+
+
+class BiLevel(eqx.Module):
+    """Networks of the agent level and of the global level; parameters shared by all agents."""
+
+    filter: AgentFilter
+    state_encoder: MLP
+    global_recurrent: Recurrent
+    global_posterior: Categoricals
+    global_prior: Categoricals
+    agent_prior: Categoricals
+    heads: Heads
+
+    def __init__(self, spec: EnvSpec, config: WorldModelConfig, n_seen: int, key: PRNGKey):
+        """The global posterior sees the z_agent of `n_seen` agents."""
+        keys = jax.random.split(key, 7)
+        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
+        latent_dim, action_dim = k * c, spec.action_space.size
+        level_dim = hidden + latent_dim
+        self.filter = AgentFilter(spec.obs_dim, action_dim, hidden, k, c, keys[0])
+        self.state_encoder = MLP(spec.state_dim, hidden, hidden, 2, keys[1])
+        self.global_recurrent = Recurrent(latent_dim, spec.n_agents * action_dim, hidden, keys[2])
+        self.global_posterior = Categoricals(
+            2 * hidden + n_seen * latent_dim, hidden, k, c, keys[3]
+        )
+        self.global_prior = Categoricals(hidden, hidden, k, c, keys[4])
+        self.agent_prior = Categoricals(hidden + latent_dim, hidden, k, c, keys[5])
+        self.heads = Heads(
+            agent_dim=level_dim,
+            full_dim=2 * level_dim,
+            obs_dim=spec.obs_dim,
+            action_dim=action_dim,
+            hidden=hidden,
+            n_hidden=config.n_hidden,
+            both_levels_reward=config.reward_input == "both",
+            key=keys[6],
+        )
+
+    def encode(self, row: TimeStep, spec: EnvSpec) -> Inputs:
+        """Encode actions, observations and the state of one row."""
+        return Inputs(
+            prev_action=spec.action_space.encode(row.prev_action),
+            obs=jax.vmap(self.filter.embed)(row.obs),
+            state=jax.nn.relu(self.state_encoder(row.state)),
+            is_first=row.is_first,
+        )

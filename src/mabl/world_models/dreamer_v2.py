@@ -1,0 +1,93 @@
+"""Multi-agent Dreamer-v2 [13]: the agent level of MABL alone, parameters shared by all agents."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Bool, Float
+
+from mabl.envs.base import EnvSpec
+from mabl.types import PRNGKey, TimeStep
+from mabl.world_models.base import WorldModelConfig
+from mabl.world_models.heads import Heads, Predictions
+from mabl.world_models.levels import AgentFilter, Categoricals, Level, draw, forget, team_of
+
+
+class Inputs(NamedTuple):
+    """A row as the scan over time needs it."""
+
+    prev_action: Float[Array, "N A"]
+    obs: Float[Array, "N D"]
+    is_first: Bool[Array, ""]
+
+
+class DreamerV2(eqx.Module):
+    """One latent-variable model for every agent, of its own observations and actions only.
+
+    Its latent is one `Level` with fields `[N, ...]`.
+    """
+
+    filter: AgentFilter
+    agent_prior: Categoricals
+    heads: Heads
+    spec: EnvSpec = eqx.field(static=True)
+
+    def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
+        keys = jax.random.split(key, 3)
+        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
+        self.spec = spec
+        self.filter = AgentFilter(spec.obs_dim, spec.action_space.size, hidden, k, c, keys[0])
+        self.agent_prior = Categoricals(hidden, hidden, k, c, keys[1])
+        self.heads = Heads(
+            agent_dim=hidden + k * c,
+            full_dim=hidden + k * c,
+            obs_dim=spec.obs_dim,
+            action_dim=spec.action_space.size,
+            hidden=hidden,
+            n_hidden=config.n_hidden,
+            both_levels_reward=False,
+            key=keys[2],
+        )
+
+    def initial(self) -> Level:
+        """The team's latent before an episode's first row: zeros."""
+        return team_of(self.spec.n_agents, self.filter.initial())
+
+    def encode(self, row: TimeStep) -> Inputs:
+        """Encode actions and observations of one row."""
+        return Inputs(
+            prev_action=self.spec.action_space.encode(row.prev_action),
+            obs=jax.vmap(self.filter.embed)(row.obs),
+            is_first=row.is_first,
+        )
+
+    def observe(
+        self, latent: Level, inputs: Inputs, key: PRNGKey, train: bool = False
+    ) -> tuple[Level, dict[str, Float[Array, "N K C"]]]:
+        """h_t = f(h_{t-1}, z_{t-1}, a^i_{t-1}), z_t ~ q(z_t | o^i_t, h_t) of every agent."""
+        latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
+        keys = jax.random.split(key, self.spec.n_agents)
+        latent, logits = jax.vmap(self.filter.infer)(latent, prev_action, inputs.obs, keys)
+        return latent, {"agent": logits}
+
+    def prior(self, latent: Level, key: PRNGKey) -> tuple[Level, dict[str, Float[Array, "N K C"]]]:
+        """z_t ~ p(z_t | h_t) of every agent."""
+        logits = jax.vmap(self.agent_prior)(latent.h)
+        return Level(latent.h, draw(logits, key)), {"agent": logits}
+
+    def imagine(self, latent: Level, action: Float[Array, "N A"], key: PRNGKey) -> Level:
+        """Prior latents of the next row, every agent's after its own action."""
+        h = jax.vmap(self.filter.recurrent)(latent, action)
+        return self.prior(latent._replace(h=h), key)[0]
+
+    def predict(self, latent: Level) -> Predictions:
+        """Decode a row for every agent from its own latent."""
+        return jax.vmap(self.heads)(latent.features(), latent.features())
+
+    def actor_features(self, latent: Level) -> Float[Array, "N F"]:
+        """(z, h)."""
+        return latent.features()
+
+    def critic_features(self, latent: Level) -> Float[Array, "N F"]:
+        """(z, h): there is nothing else."""
+        return latent.features()

@@ -1,0 +1,105 @@
+"""MABL-SG (section 4.3): the bi-level model with one global latent, shared by the whole team."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mabl.envs.base import EnvSpec
+from mabl.types import PRNGKey, TimeStep
+from mabl.world_models.base import WorldModelConfig
+from mabl.world_models.bilevel import BiLevel, Inputs, Latent
+from mabl.world_models.heads import Predictions
+from mabl.world_models.levels import AgentFilter, Level, draw, forget, team_of
+
+
+class MABLSG(eqx.Module):
+    """Bi-level latent-variable world model with a single global latent of the team.
+
+    Of its `Latent`, the agent level is `[N, ...]` and the global one has no agent axis.
+    """
+
+    nets: BiLevel
+    spec: EnvSpec = eqx.field(static=True)
+    config: WorldModelConfig = eqx.field(static=True)
+
+    def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
+        self.spec, self.config = spec, config
+        self.nets = BiLevel(spec, config, spec.n_agents, key)
+
+    @property
+    def filter(self) -> AgentFilter:
+        """The agent level's posterior: all of the model that execution needs."""
+        return self.nets.filter
+
+    def initial(self) -> Latent:
+        """The latents before an episode's first row: zeros."""
+        level = self.filter.initial()
+        return Latent(agent=team_of(self.spec.n_agents, level), global_=level)
+
+    def encode(self, row: TimeStep) -> Inputs:
+        """Encode actions, observations and the state of one row."""
+        return self.nets.encode(row, self.spec)
+
+    def observe(
+        self, latent: Latent, inputs: Inputs, key: PRNGKey, train: bool = False
+    ) -> tuple[Latent, dict[str, Array]]:
+        """Posterior latents of the next row, and their logits by level.
+
+        h^a_t = f(h^a_{t-1}, z^a_{t-1}, a^i_{t-1}),   z^a_t ~ q(z^a_t | o^i_t, h^a_t) for each agent
+        h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^{a,1..N}_t, h^g_t)
+        """
+        latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
+        key_agents, key_global = jax.random.split(key)
+        keys = jax.random.split(key_agents, self.spec.n_agents)
+        agent, agent_logits = jax.vmap(self.filter.infer)(
+            latent.agent, prev_action, inputs.obs, keys
+        )
+        h = self.nets.global_recurrent(latent.global_, prev_action.ravel())
+        global_logits = self.nets.global_posterior(inputs.state, agent.z.ravel(), h)
+        global_ = Level(h, draw(global_logits, key_global))
+        return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
+
+    def prior(self, latent: Latent, key: PRNGKey) -> tuple[Latent, dict[str, Array]]:
+        """z^g_t ~ p(z^g_t | h^g_t), and every agent's z^a_t ~ p(z^a_t | h^a_t, z^g_t).
+
+        `config.agent_prior_input` says which z^g the agents' priors see, as in MABL.
+        """
+        given = latent.global_.z if self.config.agent_prior_input == "posterior" else None
+        return self._transition(latent, key, given)
+
+    def imagine(self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey) -> Latent:
+        """Prior latents of the next row after the joint (encoded) action."""
+        h_agent = jax.vmap(self.filter.recurrent)(latent.agent, action)
+        h_global = self.nets.global_recurrent(latent.global_, action.ravel())
+        moved = Latent(latent.agent._replace(h=h_agent), latent.global_._replace(h=h_global))
+        return self._transition(moved, key)[0]
+
+    def _transition(
+        self, latent: Latent, key: PRNGKey, z_global: Float[Array, " KC"] | None = None
+    ) -> tuple[Latent, dict[str, Array]]:
+        """Samples and logits given the deterministic parts of `latent`."""
+        key_agents, key_global = jax.random.split(key)
+        global_logits = self.nets.global_prior(latent.global_.h)
+        global_ = Level(latent.global_.h, draw(global_logits, key_global))
+        seen = global_.z if z_global is None else z_global
+        agent_logits = jax.vmap(self.nets.agent_prior, in_axes=(0, None))(latent.agent.h, seen)
+        agent = Level(latent.agent.h, draw(agent_logits, key_agents))
+        return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
+
+    def predict(self, latent: Latent) -> Predictions:
+        """Decode a row for every agent from its own level and the team's."""
+        return jax.vmap(self.nets.heads)(self.actor_features(latent), self.critic_features(latent))
+
+    def actor_features(self, latent: Latent) -> Float[Array, "N F"]:
+        """(z^a, h^a): all that a policy may see."""
+        return latent.agent.features()
+
+    def critic_features(self, latent: Latent) -> Float[Array, "N G"]:
+        """Each agent's (z^a, h^a) beside the team's (z^g, h^g)."""
+        team = team_of(self.spec.n_agents, latent.global_.features())
+        return jnp.concatenate([latent.agent.features(), team], axis=-1)
+
+    def global_features(self, latent: Latent) -> Float[Array, "N KC"]:
+        """z^g, the same for every agent."""
+        return team_of(self.spec.n_agents, latent.global_.z)

@@ -1,0 +1,284 @@
+"""MAMBA [7]: the agent level, its agents talking through a transformer at every step.
+
+What agents say to each other is needed to know where one is, so execution is centralised. With
+`shared=False` every agent has parameters of its own, as in MAG [42].
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mabl.envs.base import EnvSpec
+from mabl.errors import UserError, require_between, require_positive
+from mabl.nets.attention import TransformerEncoder
+from mabl.nets.mlp import MLP, Linear
+from mabl.types import PRNGKey, TimeStep
+from mabl.world_models.base import WorldModelConfig
+from mabl.world_models.heads import Heads, Predictions
+from mabl.world_models.levels import Categoricals, Level, draw, forget
+
+
+@dataclass(frozen=True)
+class CommunicationConfig:
+    """The transformer over agents. Defaults are MAMBA's."""
+
+    FLAG_PREFIX: ClassVar[str] = "communication."
+
+    n_layers: int = 3
+    """Layers, each as wide as the world model's hidden layers."""
+    n_heads: int = 8
+    """Heads of each layer's attention."""
+    dropout: float = 0.1
+    """Share of activations dropped in training the model; never in acting and imagination."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "n_layers", "n_heads")
+        require_between(self, 0, 1, "dropout")
+
+
+class Latent(NamedTuple):
+    """The team's latent: a level `[N, ...]`, and who was alive to be heard."""
+
+    level: Level
+    alive: Bool[Array, " N"]
+
+
+class Inputs(NamedTuple):
+    """A row as the scan over time needs it."""
+
+    prev_action: Float[Array, "N A"]
+    obs: Float[Array, "N D"]
+    alive: Bool[Array, " N"]
+    is_first: Bool[Array, ""]
+
+
+class Team(eqx.Module):
+    """Networks of a team's agents: one set that all share, or one for each along axis 0."""
+
+    nets: Any
+    shared: bool = eqx.field(static=True)
+
+    def __init__(self, make: Callable[[PRNGKey], Any], n_agents: int, shared: bool, key: PRNGKey):
+        self.shared = shared
+        keys = jax.random.split(key, n_agents)
+        self.nets = make(keys[0]) if shared else eqx.filter_vmap(make)(keys)
+
+    def map(self, function: Callable[..., Any], *inputs: Any) -> Any:
+        """`function(nets, *inputs)` of every agent, with its own slice of the inputs."""
+        axes = (None if self.shared else 0, *[0] * len(inputs))
+        return jax.vmap(function, in_axes=axes)(self.nets, *inputs)
+
+
+class FilterNets(eqx.Module):
+    """What one agent needs to know where it is."""
+
+    encoder: MLP
+    inputs: Linear
+    communication: TransformerEncoder
+    cell: eqx.nn.GRUCell
+    posterior: Categoricals
+
+    def __init__(
+        self,
+        spec: EnvSpec,
+        config: WorldModelConfig,
+        communication: CommunicationConfig,
+        key: PRNGKey,
+    ):
+        keys = jax.random.split(key, 5)
+        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
+        self.encoder = MLP(spec.obs_dim, hidden, hidden, 2, keys[0])
+        self.inputs = Linear(k * c + spec.action_space.size, hidden, keys[1])
+        self.communication = TransformerEncoder(
+            hidden, communication.n_layers, communication.n_heads, communication.dropout, keys[2]
+        )
+        self.cell = eqx.nn.GRUCell(hidden, hidden, key=keys[3])
+        self.posterior = Categoricals(2 * hidden, hidden, k, c, keys[4])
+
+    def listen(
+        self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey | None
+    ) -> Float[Array, "N D"]:
+        """What this agent's transformer makes of everybody's z and action."""
+        said = jnp.concatenate([latent.level.z, action], axis=-1)
+        said = jax.nn.relu(jax.vmap(self.inputs)(said))
+        return self.communication(said, latent.alive, key)
+
+
+class JointFilter(eqx.Module):
+    """What a team runs to know where it is; every agent's latent depends on everybody's."""
+
+    team: Team
+    n_agents: int = eqx.field(static=True)
+    obs_dim: int = eqx.field(static=True)
+    latent_dim: int = eqx.field(static=True)
+    hidden: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        spec: EnvSpec,
+        config: WorldModelConfig,
+        communication: CommunicationConfig,
+        shared: bool,
+        key: PRNGKey,
+    ):
+        self.n_agents, self.obs_dim = spec.n_agents, spec.obs_dim
+        self.latent_dim, self.hidden = config.n_categoricals * config.n_classes, config.hidden
+        self.team = Team(
+            lambda key: FilterNets(spec, config, communication, key), spec.n_agents, shared, key
+        )
+
+    def initial(self) -> Latent:
+        """The team's latent before an episode's first row: zeros, nobody to be heard."""
+        n = self.n_agents
+        level = Level(jnp.zeros((n, self.hidden)), jnp.zeros((n, self.latent_dim)))
+        return Latent(level, jnp.zeros(n, bool))
+
+    def embed(self, obs: Float[Array, "N O"]) -> Float[Array, "N D"]:
+        """Encode every agent's observation; independent of the past."""
+        return self.team.map(lambda nets, obs: jax.nn.relu(nets.encoder(obs)), obs)
+
+    def recur(
+        self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey | None = None
+    ) -> Float[Array, "N D"]:
+        """h^i_t = GRU(h^i_{t-1}, transformer(z_{t-1}, a_{t-1})^i); dropout if there is a key."""
+
+        def one(nets: FilterNets, i: Array, h: Array) -> Array:
+            return nets.cell(nets.listen(latent, action, key)[i], h)
+
+        return self.team.map(one, jnp.arange(self.n_agents), latent.level.h)
+
+    def infer(
+        self,
+        latent: Latent,
+        prev_action: Float[Array, "N A"],
+        embed: Float[Array, "N D"],
+        alive: Bool[Array, " N"],
+        key: PRNGKey,
+        train: bool = False,
+    ) -> tuple[Latent, Float[Array, "N K C"]]:
+        """h_t as in `recur`, then z^i_t ~ q(z^i_t | o^i_t, h^i_t), and the logits."""
+        key_draw, key_dropout = jax.random.split(key)
+        h = self.recur(latent, prev_action, key_dropout if train else None)
+        logits = self.team.map(lambda nets, *seen: nets.posterior(*seen), h, embed)
+        return Latent(Level(h, draw(logits, key_draw)), alive), logits
+
+    def joint(
+        self,
+        memory: Latent,
+        prev_action: Float[Array, "N A"],
+        obs: Float[Array, "N O"],
+        alive: Bool[Array, " N"],
+        key: PRNGKey,
+    ) -> Latent:
+        """One step of execution, with everybody's observations in one place."""
+        return self.infer(memory, prev_action, self.embed(obs), alive, key)[0]
+
+    def features(self, memory: Latent) -> Float[Array, "N F"]:
+        """(z_t, h_t) of every agent."""
+        return memory.level.features()
+
+
+class DecoderNets(eqx.Module):
+    """What one agent imagines with, beside its filter."""
+
+    prior: Categoricals
+    heads: Heads
+
+    def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
+        key_prior, key_heads = jax.random.split(key)
+        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
+        self.prior = Categoricals(hidden, hidden, k, c, key_prior)
+        self.heads = Heads(
+            agent_dim=hidden + k * c,
+            full_dim=hidden + k * c,
+            obs_dim=spec.obs_dim,
+            action_dim=spec.action_space.size,
+            hidden=hidden,
+            n_hidden=config.n_hidden,
+            both_levels_reward=False,
+            key=key_heads,
+        )
+
+
+class MAMBA(eqx.Module):
+    """One level for every agent, whose recurrent input is a transformer over agents."""
+
+    filter: JointFilter
+    decoders: Team
+    spec: EnvSpec = eqx.field(static=True)
+
+    def __init__(
+        self,
+        spec: EnvSpec,
+        config: WorldModelConfig,
+        key: PRNGKey,
+        communication: CommunicationConfig,
+        shared: bool = True,
+    ):
+        if config.hidden % communication.n_heads:
+            raise UserError(
+                f"--world-model.hidden is {config.hidden}: give a multiple of the "
+                f"{communication.n_heads} --communication.n-heads"
+            )
+        key_filter, key_decoders = jax.random.split(key)
+        self.spec = spec
+        self.filter = JointFilter(spec, config, communication, shared, key_filter)
+        self.decoders = Team(
+            lambda key: DecoderNets(spec, config, key), spec.n_agents, shared, key_decoders
+        )
+
+    def initial(self) -> Latent:
+        """The team's latent before an episode's first row."""
+        return self.filter.initial()
+
+    def encode(self, row: TimeStep) -> Inputs:
+        """Encode actions and observations of one row."""
+        return Inputs(
+            prev_action=self.spec.action_space.encode(row.prev_action),
+            obs=self.filter.embed(row.obs),
+            alive=row.alive,
+            is_first=row.is_first,
+        )
+
+    def observe(
+        self, latent: Latent, inputs: Inputs, key: PRNGKey, train: bool = False
+    ) -> tuple[Latent, dict[str, Float[Array, "N K C"]]]:
+        """Posterior latents of the next row, and their logits; see `JointFilter.infer`."""
+        latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
+        latent, logits = self.filter.infer(
+            latent, prev_action, inputs.obs, inputs.alive, key, train
+        )
+        return latent, {"agent": logits}
+
+    def prior(
+        self, latent: Latent, key: PRNGKey
+    ) -> tuple[Latent, dict[str, Float[Array, "N K C"]]]:
+        """z^i_t ~ p(z^i_t | h^i_t) of every agent."""
+        logits = self.decoders.map(lambda nets, h: nets.prior(h), latent.level.h)
+        level = Level(latent.level.h, draw(logits, key))
+        return Latent(level, latent.alive), {"agent": logits}
+
+    def imagine(self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey) -> Latent:
+        """Prior latents of the next row; who dies in it is not heard from then on."""
+        h = self.filter.recur(latent, action)
+        after = self.prior(Latent(Level(h, latent.level.z), latent.alive), key)[0]
+        return after._replace(alive=latent.alive & (self.predict(after).alive > 0))
+
+    def predict(self, latent: Latent) -> Predictions:
+        """Decode a row for every agent from its own latent."""
+        return self.decoders.map(
+            lambda nets, features: nets.heads(features, features), latent.level.features()
+        )
+
+    def actor_features(self, latent: Latent) -> Float[Array, "N F"]:
+        """(z, h)."""
+        return latent.level.features()
+
+    def critic_features(self, latent: Latent) -> Float[Array, "N F"]:
+        """(z, h): agents have already heard of each other."""
+        return latent.level.features()
