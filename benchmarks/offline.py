@@ -6,7 +6,7 @@
 Trains a world model from scratch on the rows of most environments in the run's replay and tells how
 well it predicts the others' (`held_out`) and its own (`trained`); with `--model-updates 0` it keeps
 the run's own model. Then trains a policy from scratch in its imagination and plays it. One JSON
-object a line.
+object a line. RUN is one of a world model and a behaviour in its imagination: not of MAG or MAPPO.
 """
 
 import argparse
@@ -18,10 +18,12 @@ from pathlib import Path
 import jax
 import yaml
 
+from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config, from_dict
-from mabl.algorithms.model_based import Learner
+from mabl.algorithms.model_based import Learner, ModelBased
 from mabl.cli import use_compilation_cache
 from mabl.evaluation import evaluate, summary
+from mabl.execution import executor_of
 from mabl.replay import Replay
 from mabl.runs import folder
 from mabl.runs.checkpoint import Checkpoints
@@ -52,8 +54,13 @@ def environments(replay: Replay, which: slice) -> Replay:
     return jax.tree.map(lambda x: x[which], replay)
 
 
+def replayed(replay: Replay) -> Experience:
+    """All that a model-based algorithm learns from: no newest rows."""
+    return Experience(replay, before=None, newest=None)  # pyright: ignore[reportArgumentType]
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("run", type=Path)
     parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
     parser.add_argument("--model-updates", type=int, default=1000, help="in fifties")
@@ -68,13 +75,15 @@ def main() -> None:
 
     config = folder.read_config(args.run)
     training = build(config)
+    if not isinstance(training.algorithm, ModelBased):
+        parser.error(f"{config.algo} is not just a world model and a behaviour in its imagination")
     shape = jax.eval_shape(training.init, jax.random.key(0))
     state = Checkpoints(args.run / "checkpoints").restore("state", shape)
     trained = environments(state.replay, slice(HELD_OUT, None))
     held_out = environments(state.replay, slice(HELD_OUT))
 
     training = build(overridden(config, args.set))
-    algorithm = training.algorithm
+    algorithm, action_space = training.algorithm, training.env.spec.action_space
     key_init, key_model, key_policy, key_play = jax.random.split(jax.random.key(args.seed), 4)
     learner = algorithm.init(key_init)
     if args.model_updates == 0:
@@ -84,7 +93,8 @@ def main() -> None:
         @jax.jit
         def chunk(learner: Learner, rows: Replay, key: PRNGKey) -> Learner:
             keys = jax.random.split(key, CHUNK)
-            return jax.lax.scan(lambda carry, key: update(carry, rows, key), learner, keys)[0]
+            experience = replayed(rows)
+            return jax.lax.scan(lambda carry, key: update(carry, experience, key), learner, keys)[0]
 
         return chunk
 
@@ -105,7 +115,7 @@ def main() -> None:
         report(args.model_updates)
     for n in range(CHUNK, args.policy_updates + 1, CHUNK):
         learner = fit_policy(learner, trained, jax.random.fold_in(key_policy, n))
-        executor = algorithm.executor(algorithm.policy(learner), greedy=True)
+        executor = executor_of(algorithm.policy(learner), action_space, greedy=True)
         results = evaluate(training.env, executor, key_play, args.episodes)
         played = {k: round(v, 3) for k, v in summary(results, training.env.spec).items()}
         print(json.dumps({"policy_updates": n, "greedy": True, **played}), flush=True)

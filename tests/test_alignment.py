@@ -14,11 +14,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from mabl.algorithms.model_based import ModelBased, starts
 from mabl.algorithms.presets import preset
 from mabl.behaviour.actor import MaskedCategorical
+from mabl.behaviour.mappo import MAPPO
 from mabl.envs.base import Discrete
 from mabl.envs.counting import CountingEnv
-from mabl.imagination import imagine_trajectory
+from mabl.imagination import Dream, ImaginationConfig, Imagined, imagine_trajectory
 from mabl.replay import sample_sequences
 from mabl.training.loop import Training, steps_in
+from mabl.types import Trajectory
 from mabl.world_models.base import observe_sequence
 from mabl.world_models.heads import Predictions
 from mabl.world_models.mabl import MABL
@@ -47,13 +49,16 @@ class Witness(eqx.Module):
     def encode(self, row):
         return row.prev_action, row.obs, row.state, row.is_first
 
-    def observe(self, latent, inputs, key):
+    def observe(self, latent, inputs, key, train=False):
         return Seen(latent.count + 1, *inputs), {"level": jnp.zeros((2, 1, 1))}
 
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Sequences `[32, LENGTH]` from a replay filled by `Training`, and what `Witness` saw."""
+    """Sequences `[32, LENGTH]` from a replay filled by `Training`, and what `Witness` saw.
+
+    Then the replay, and of each `collect` the steps and the rollout.
+    """
     config = preset("quick", "test/counting", "mabl")
     config = replace(
         config,
@@ -70,30 +75,30 @@ def drawn():
         mappo=replace(config.mappo, hidden=16, n_hidden=1),
     )
     env = CountingEnv()
-    training = Training(env, ModelBased(MABL, env.spec, config))
+    training = Training(env, ModelBased(MABL, MAPPO(config.mappo), env.spec, config))
 
     @jax.jit
     def fill(key):
         state = training.init(key)
-        collectors, replay, steps = state.collectors, state.replay, []
+        collectors, replay, parts = state.collectors, state.replay, []
         for i in range(4):  # 40 rows in lanes of 25: the ring wraps around
             key_collect = jax.random.fold_in(key, i)
             collectors, collected = training.collect(state.learner, collectors, key_collect)
             replay = training.store(replay, collected)
-            steps.append(steps_in(collected))
+            parts.append((steps_in(collected), collected))
         rows = sample_sequences(replay, jax.random.key(1), 32, LENGTH)
         latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
             Witness(),
             rows,
             jax.random.split(jax.random.key(2), 32),
         )
-        return rows, latents, replay, jnp.stack(steps)
+        return rows, latents, replay, jax.tree.map(lambda *x: jnp.stack(x), *parts)
 
     return jax.device_get(fill(jax.random.key(0)))
 
 
 def test_environment_steps_are_rows_that_are_not_resets(drawn):
-    _, _, replay, steps = drawn
+    _, _, replay, (steps, _) = drawn
     assert_array_equal(replay.size, [25] * 3)
     assert_array_equal(replay.cursor, [40 % 25] * 3)
     # 4 x 10 rows in 3 environments, episodes of 6 or 8 rows: 5 to 7 resets in each
@@ -118,6 +123,18 @@ def test_stored_rewards_are_scaled_and_belong_to_their_row(drawn):
     assert_array_equal(rows.reward, np.where(rows.is_first[..., None], 0, expected))
 
 
+def test_collected_rewards_are_scaled_but_returns_of_episodes_are_not(drawn):
+    *_, (_, collected) = drawn
+    first = jax.tree.map(lambda x: x[0], collected)  # 10 rows from a reset on
+    for lane in range(3):
+        rows, episodes = jax.tree.map(lambda x, lane=lane: x[lane], (first.rows, first.episodes))
+        end = int(episodes.ended.argmax())
+        assert end == (5 if rows.state[0, 1] % 2 == 0 else 7)
+        rewards = 100 * rows.state[1 : end + 1, :1] + rows.prev_action[1 : end + 1]
+        assert_array_equal(rows.reward[1 : end + 1], 0.5 * rewards)
+        assert episodes.episode_return[end] == rewards.mean(-1).sum()
+
+
 def test_actions_were_available_at_the_row_before(drawn):
     rows, *_ = drawn
     stepped = ~rows.is_first
@@ -136,10 +153,12 @@ def test_the_model_sees_row_t_with_the_action_that_led_to_it(drawn):
 
 
 @pytest.mark.parametrize("n_starts", [None, 20, 150, 32 * LENGTH])
-def test_starts_pair_each_latent_with_its_own_rows_availability_and_end(drawn, n_starts):
+def test_starts_pair_each_latent_with_its_own_rows_availability_life_and_end(drawn, n_starts):
     rows, seen, *_ = drawn
-    latent, available, weight = starts(
-        jax.tree.map(jnp.asarray, (seen, rows)), jax.random.key(0), n_starts
+    t = rows.state[..., 0]
+    rows = rows._replace(alive=np.stack([t % 2 == 0, t % 4 < 2], -1))
+    (latent, available, alive), weight = starts(
+        *jax.tree.map(jnp.asarray, (seen, rows)), jax.random.key(0), n_starts
     )
     latent = jax.device_get(latent)
     size = n_starts or 32 * LENGTH
@@ -147,6 +166,7 @@ def test_starts_pair_each_latent_with_its_own_rows_availability_and_end(drawn, n
     t, episode = latent.state[:, 0].astype(int), latent.state[:, 1].astype(int)
     assert_array_equal(latent.obs[:, :, 0], np.stack([t, t], -1))
     assert_array_equal(available, (np.arange(3) != t[:, None] % 3)[:, None].repeat(2, 1))
+    assert_array_equal(alive, np.stack([t % 2 == 0, t % 4 < 2], -1))
     assert_array_equal(weight, np.where(episode % 2 == 0, t != 5, t != 7))
 
 
@@ -157,11 +177,12 @@ def test_starts_that_end_an_episode_are_drawn_last_and_none_twice(drawn):
     going_on = int(np.where(episode % 2 == 0, t != 5, t != 7).sum())
     assert going_on < 32 * LENGTH
     for n_starts in (1, going_on, going_on + 1, 32 * LENGTH):
-        latent, _, weight = starts((number, rows), jax.random.key(0), n_starts)
+        start, weight = starts(number, rows, jax.random.key(0), n_starts)
         assert weight.sum() == min(n_starts, going_on)
-        assert len(np.unique(latent)) == n_starts
+        assert len(np.unique(start.latent)) == n_starts
     few = [
-        tuple(np.asarray(starts((number, rows), jax.random.key(seed), 8)[0])) for seed in range(3)
+        tuple(np.asarray(starts(number, rows, jax.random.key(seed), 8)[0].latent))
+        for seed in range(3)
     ]
     assert len(set(few)) == 3  # another key, other starts
 
@@ -181,7 +202,7 @@ class Clockwork(eqx.Module):
     """A world model that counts.
 
     At count c the reward is 100 c + the action that led there, action (c mod 3) is unavailable;
-    11 is the end with probability 1/4, 13 for certain.
+    11 is the end with probability 1/4, 13 for certain. Agent 1 is dead at 12, and at 12 alone.
     """
 
     def actor_features(self, latent):
@@ -199,33 +220,54 @@ class Clockwork(eqx.Module):
             obs=jnp.zeros((2, 1)),
             reward=100.0 * c + latent.action,
             agent_reward=jnp.full(2, -1.0),
+            alive=jnp.where((c == 12) & (jnp.arange(2) == 1), -0.1, 0.1),
             terminated=jnp.where(c == 13, 99.0, jnp.where(c == 11, -jnp.log(3.0), -99.0)),
             available=jnp.where(jnp.arange(3)[None] != c[:, None] % 3, 99.0, -99.0),
             action=jnp.zeros((2, 3)),
         )
 
 
+def imagine(
+    start: Imagined,
+    model: Clockwork | None = None,
+    logits: Array | None = None,
+    weight: float = 1.0,
+    seed: int = 3,
+    step=Dream.step,
+    **options,
+) -> Trajectory:
+    """What a policy with these logits lives through in a clockwork's imagination."""
+    model = Clockwork() if model is None else model
+    logits = jnp.zeros(3) if logits is None else logits
+    dream = Dream(
+        model,
+        lambda features, available: MaskedCategorical.of(logits, available),
+        Discrete(3),
+        ImaginationConfig(**options),
+        model.critic_features,
+    )
+    return imagine_trajectory(dream, start, jnp.float32(weight), jax.random.key(seed), step)
+
+
+def at(count: int, available=(True, True, True), alive=(True, True)) -> Imagined:
+    """Both agents at that count."""
+    latent = Counter(jnp.full(2, count), jnp.array([0, 0]))
+    return Imagined(latent, jnp.broadcast_to(jnp.array(available), (2, 3)), jnp.array(alive))
+
+
 @pytest.mark.parametrize("horizon", [2, 6])
 def test_imagined_fields_are_aligned_as_trajectory_documents(horizon):
-    start = Counter(jnp.array([10, 10]), jnp.array([0, 0]))
     # At the start the real availability counts, here action 1 alone, whatever the model says.
-    available = jnp.broadcast_to(jnp.array([False, True, False]), (2, 3))
-    trajectory = imagine_trajectory(
-        Clockwork(),
-        lambda features, available: MaskedCategorical.of(jnp.zeros(3), available),
-        start,
-        available,
-        jnp.float32(0.5),
-        jax.random.key(3),
-        horizon,
-        Discrete(3),
-    )
+    trajectory = imagine(at(10, (False, True, False)), weight=0.5, horizon=horizon)
+    view = trajectory.view
     count = np.arange(10, 10 + horizon)
-    assert_array_equal(trajectory.actor_features, count[:, None, None].repeat(2, 1))
-    assert_array_equal(trajectory.critic_features, 10 * count[:, None, None].repeat(2, 1))
+    assert_array_equal(view.actor_features, count[:, None, None].repeat(2, 1))
+    assert_array_equal(view.critic_features, 10 * count[:, None, None].repeat(2, 1))
     for h in range(horizon):
         expected = [False, True, False] if h == 0 else np.arange(3) != count[h] % 3
-        assert_array_equal(trajectory.available[h], [expected] * 2)
+        assert_array_equal(view.available[h], [expected] * 2)
+        # Agent 1 dies at count 12 and stays dead, although the model says at 13 that it lives.
+        assert_array_equal(view.alive[h], [True, count[h] < 12])
     for field in ("action", "log_prob", "reward", "continues", "weight"):
         assert getattr(trajectory, field).shape == (horizon - 1, 2), field
     for h in range(horizon - 1):  # the transition from row h to row h + 1
@@ -240,21 +282,46 @@ def test_imagined_fields_are_aligned_as_trajectory_documents(horizon):
         assert_allclose(trajectory.weight[h], [0.5 * [1, 0.75, 0.75, 0, 0][h]] * 2, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("count", "alive", "expected"),
+    [
+        # Dead at the start, whatever the model says of later rows.
+        (20, [False, True], [[False, True]] * 5),
+        (20, [False, False], [[False, False]] * 5),
+        # Agent 1 dies on arriving at 12, the third row; agent 0 is dead already.
+        (10, [False, True], [[False, True]] * 2 + [[False, False]] * 3),
+        # At the start what is real counts, not what the model would say there.
+        (12, [True, True], [[True, True]] * 5),
+        # Only on arriving: the first imagined row is 12 itself.
+        (11, [True, True], [[True, True]] + [[True, False]] * 4),
+    ],
+)
+@pytest.mark.parametrize("sample", [True, False])
+def test_nobody_comes_back_to_life_in_imagination(count, alive, expected, sample):
+    # The model's mode counts, at logits of 0.1 and -0.1, never a sample.
+    trajectory = imagine(at(count, alive=alive), horizon=5, sample_availability=sample)
+    assert_array_equal(trajectory.view.alive, expected)
+
+
 def test_no_gradient_flows_through_imagination():
     def total(scale):
-        trajectory = imagine_trajectory(
-            Clockwork(),
-            lambda features, available: MaskedCategorical.of(scale * jnp.arange(3.0), available),
-            Counter(jnp.array([10, 10]), jnp.array([0, 0])),
-            jnp.ones((2, 3), bool),
-            jnp.float32(1.0),
-            jax.random.key(3),
-            3,
-            Discrete(3),
-        )
-        return trajectory.log_prob.sum()
+        return imagine(at(10), logits=scale * jnp.arange(3.0), horizon=3).log_prob.sum()
 
     assert jax.grad(total)(1.0) == 0
+
+
+def test_imagination_moves_on_by_the_step_that_it_is_given():
+    def leap(dream, state, action, key):
+        """Two steps with the same action; what is said is said of where it lands."""
+        return dream.step(dream.step(state, action, key)[0], action, key)
+
+    trajectory = imagine(at(10), step=leap, horizon=4)
+    assert_array_equal(trajectory.view.actor_features[:, :, 0], [[c] * 2 for c in (10, 12, 14, 16)])
+    assert_array_equal(trajectory.view.alive[:, 1], [True, False, False, False])
+    for h, count in enumerate((12, 14, 16)):
+        assert_array_equal(trajectory.reward[h], 100 * count + trajectory.action[h])
+    # From 11 agent 1 dies at 12, on the way to 13.
+    assert_array_equal(imagine(at(11), step=leap, horizon=2).view.alive[:, 1], [True, False])
 
 
 class Doubtful(Clockwork):
@@ -266,15 +333,5 @@ class Doubtful(Clockwork):
 
 @pytest.mark.parametrize(("sample", "share"), [(True, 0.6), (False, 1.0)])
 def test_imagined_availability_is_a_sample_or_the_mode(sample, share):
-    trajectory = imagine_trajectory(
-        Doubtful(),
-        lambda features, available: MaskedCategorical.of(jnp.zeros(3), available),
-        Counter(jnp.array([0, 0]), jnp.array([0, 0])),
-        jnp.ones((2, 3), bool),
-        jnp.float32(1.0),
-        jax.random.key(0),
-        200,
-        Discrete(3),
-        sample,
-    )
-    assert_allclose(trajectory.available[1:].mean(), share, atol=0.05)
+    trajectory = imagine(at(0), Doubtful(), seed=0, horizon=200, sample_availability=sample)
+    assert_allclose(trajectory.view.available[1:].mean(), share, atol=0.05)

@@ -12,24 +12,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
-from mabl import Policy, UserError, cli
+from mabl import Policy, TeamPolicy, UserError, cli
 from mabl.runs import folder as run_folder
 
+COORDINATION = ["--env=test/coordination"]
 TINY = [
-    "--env=test/coordination",
+    *COORDINATION,
     "--world-model.hidden=16",
     "--world-model.n-categoricals=2",
     "--world-model.n-classes=4",
     "--world-model.batch-size=4",
     "--mappo.hidden=16",
-    "--mappo.n-starts=16",
+    "--imagination.n-starts=16",
     "--training.model-updates=2",
     "--training.policy-updates=1",
     "--training.prefill-steps=200",
     "--training.pretrain-updates=3",
     "--training.diagnose-every=300",
 ]
+
+
+SECTIONS = {"training", "world_model", "imagination", "mappo"}
+"""Parts of the configuration that MABL reads."""
 
 
 @pytest.fixture
@@ -63,13 +69,28 @@ MISTAKES = {
     "environment": (["train", "--env", "smax/3n"], "unknown environment 'smax/3n': did you mean"),
     "family": (["train", "--env", "smac/3m"], "unknown environment 'smac/3m'"),
     "task": (["train", "--env", "3m"], "unknown environment '3m': did you mean smax/3m?"),
-    "algorithm": (["train", "--algo", "mable"], "unknown algorithm 'mable': did you mean mabl?"),
+    "algorithm": (["train", "--algo", "mable"], "unknown algorithm 'mable': did you mean mabl or"),
     "preset": (["train", "--preset", "quik"], "unknown preset 'quik': did you mean quick?"),
     "command": (["trian"], "unknown command 'trian': did you mean train?"),
     "range": (["train", "--mappo.gamma", "2"], "--mappo.gamma is 2.0: give a number from 0 to 1"),
     "zero": (["train", "--total-steps", "0"], "--total-steps is 0: give a number above 0"),
     "negative": (["train", "--training.model-updates=-1"], "--training.model-updates is -1"),
-    "capacity": (["train", "--training.replay-capacity=16"], "--training.replay-capacity 16"),
+    # Rows for each environment: 16 of a cycle, or 20 of a sequence, or an episode of 60 + 1.
+    "capacity": (
+        ["train", *COORDINATION, "--training.collect-steps=16", "--training.replay-capacity=127"],
+        "--training.replay-capacity 127 is too small for 8 environments of test/coordination: "
+        "give at least 128\n",
+    ),
+    "capacity for a sequence": (
+        ["train", "--training.replay-capacity=16"],
+        "--training.replay-capacity 16 is too small for 16 environments of smax/3m: "
+        "give at least 320\n",
+    ),
+    "capacity for an episode": (
+        ["train", "--preset=paper", "--training.replay-capacity=60"],
+        "--training.replay-capacity 60 is too small for 1 environments of smax/3m: "
+        "give at least 61\n",
+    ),
     "sequence": (
         ["train", "--world-model.batch-length=1"],
         "--world-model.batch-length is 1: give a number from 2",
@@ -111,6 +132,23 @@ def test_a_mistake_is_one_line_and_exit_code_2(mabl, name):
 def test_a_misspelt_flag_is_explained(mabl):
     code, _, err = mabl("train", "--mappo.gama", "0.9")
     assert code == 2 and "--mappo.gamma" in err
+
+
+@pytest.mark.parametrize(
+    ("algo", "flag"),
+    [
+        ("mabl", "--qmix.hidden"),
+        ("mabl", "--communication.n-layers"),
+        ("mabl-qmix", "--mappo.hidden"),
+        ("mappo", "--world-model.hidden"),
+        ("mappo", "--imagination.horizon"),
+    ],
+)
+def test_what_an_algorithm_does_not_read_has_no_flags(mabl, algo, flag):
+    code, _, err = mabl("train", f"--algo={algo}", f"{flag}=8")
+    assert code == 2 and flag in err
+    code, out, _ = mabl("train", f"--algo={algo}", "--help")
+    assert code == 0 and f"{flag.split('.')[0]}." not in out and "--training.num-envs" in out
 
 
 def test_a_logdir_that_cannot_be_written_is_named(mabl, tmp_path):
@@ -177,6 +215,9 @@ def test_a_run_folder_holds_what_the_documentation_says(trained):
         "tensorboard",
         "checkpoints",
     }
+    config = yaml.safe_load((trained / "config.yaml").read_text())
+    assert {name for name, value in config.items() if isinstance(value, dict)} == SECTIONS
+    assert config["algo"] == "mabl" and config["imagination"]["n_starts"] == 16
     steps = [row["step"] for row in rows_of(trained)]
     assert steps == sorted(set(steps)) and steps[-1] >= 600
     last = rows_of(trained)[-1]
@@ -241,10 +282,44 @@ def test_one_agent_acts_with_its_own_policy(trained):
 
 def test_a_greedy_policy_starts_anew_after_reset(trained):
     policy = Policy.load(trained)
-    before = policy._level
+    before = policy._memory
     policy.act(np.ones(6))
     policy.reset()
-    assert all((a == b).all() for a, b in zip(before, policy._level, strict=True))
+    assert all((a == b).all() for a, b in zip(before, policy._memory, strict=True))
+
+
+def test_a_team_acts_with_one_policy(trained):
+    team = TeamPolicy.load(trained, greedy=False, seed=3)
+    obs = np.zeros((2, 6), np.float32)
+    available = np.array([[False, True, False, True], [True, False, False, True]])
+    first = np.stack([team.act(obs, available) for _ in range(20)])
+    assert set(first[:, 0]) <= {1, 3} and set(first[:, 1]) <= {0, 3}
+    assert first.shape == (20, 2) and first.dtype == np.int32
+    again = TeamPolicy.load(trained, greedy=False, seed=3)
+    alive = np.ones(2, bool)
+    assert (np.stack([again.act(obs, available, alive) for _ in range(20)]) == first).all()
+    with pytest.raises(UserError, match=r"obs has shape \(6,\), the policy expects \(2, 6\)"):
+        team.act(np.zeros(6))
+    with pytest.raises(UserError, match=r"available has shape \(4,\), the policy expects \(2, 4\)"):
+        team.act(obs, np.ones(4, bool))
+    with pytest.raises(UserError, match=r"alive has shape \(3,\), the policy expects \(2,\)"):
+        team.act(obs, available, np.ones(3, bool))
+
+
+def test_a_team_starts_anew_after_reset(trained):
+    """With the same random key it remembers after a reset what it did at the first row."""
+    obs, other = np.ones((2, 6)), np.arange(12.0).reshape(2, 6)
+    team = TeamPolicy.load(trained)
+    key = team._key
+    team.act(obs)
+    first = team._memory
+    team.act(other)
+    going_on = team._memory
+    team.reset()
+    team._key = key
+    team.act(obs)
+    assert all((a == b).all() for a, b in zip(first, team._memory, strict=True))
+    assert any((a != b).any() for a, b in zip(first, going_on, strict=True))
 
 
 def test_resuming_a_finished_run_says_so(trained, mabl):
@@ -285,8 +360,17 @@ def test_a_damaged_config_is_named(trained, mabl, tmp_path):
 
 
 def test_the_lists_name_everything(mabl):
+    from mabl.algorithms.registry import ALGORITHMS, COLUMNS
+
     code, out, _ = mabl("algos")
-    assert code == 0 and "mabl" in out
+    assert code == 0 and all(column.heading in out.splitlines()[0] for column in COLUMNS)
+    # Long descriptions go on in a line of their own, whose first column is empty.
+    listed = {line.split()[0]: line for line in out.splitlines()[1:] if line[1] != " "}
+    assert set(listed) == set(ALGORITHMS) and "mabl" in listed
+    for name, entry in ALGORITHMS.items():
+        marks = ["yes" if getattr(entry, column.field) else "no" for column in COLUMNS]
+        assert listed[name].split()[1 : 1 + len(COLUMNS)] == marks
+        assert entry.description[:20] in listed[name]
     from mabl.envs import registry
 
     code, out, _ = mabl("envs")

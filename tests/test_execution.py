@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mabl.behaviour.actor import Actor
+from mabl.behaviour.actor import Actor, MaskedCategorical
 from mabl.envs.base import Continuous, Discrete
-from mabl.execution import LocalExecutor, LocalPolicy, RandomExecutor, act_alone
+from mabl.execution import (
+    JointExecutor,
+    LocalExecutor,
+    Policy,
+    RandomExecutor,
+    act_alone,
+    executor_of,
+)
 from mabl.types import TimeStep
 from mabl.world_models.levels import AgentFilter, Level
 
@@ -21,9 +28,7 @@ def build(greedy: bool = False, out_scale: float = 3.0) -> LocalExecutor:
     """Three categoricals of four classes, h of 16."""
     key_filter, key_actor = jax.random.split(jax.random.key(0))
     agent = AgentFilter(OBS, 4, 16, 3, 4, key_filter)
-    return LocalExecutor(
-        LocalPolicy(agent, Actor(12 + 16, 4, 16, 1, out_scale, key_actor)), SPACE, greedy
-    )
+    return executor_of(Policy(agent, Actor(12 + 16, 4, 16, 1, out_scale, key_actor)), SPACE, greedy)
 
 
 def some_rows(seed: int = 0) -> TimeStep:
@@ -44,8 +49,8 @@ def some_rows(seed: int = 0) -> TimeStep:
 
 
 @eqx.filter_jit
-def play(executor: LocalExecutor, rows: TimeStep) -> tuple[Level, jax.Array]:
-    """Latents and actions `[STEPS, N, ...]`; each action is the next row's `prev_action`."""
+def play(executor: LocalExecutor | JointExecutor, rows: TimeStep) -> tuple[Level, jax.Array]:
+    """Memories and actions `[STEPS, N, ...]`; each action is the next row's `prev_action`."""
     first = jax.tree.map(lambda x: x[0], rows)
 
     def step(carry, at):
@@ -143,7 +148,7 @@ def decide(executor, row, keys):
 
     def one(key):
         level, action = executor.act(executor.initial(row), row, key)
-        features = jnp.concatenate([level.z, level.h], axis=-1)
+        features = jax.vmap(executor.policy.filter.features)(level)
         policy = jax.vmap(executor.policy.actor)(features, row.available)
         return action, jnp.exp(policy.log_probs)
 
@@ -218,3 +223,90 @@ def test_execution_starts_from_zeros_for_every_agent():
     level = build().initial(jax.tree.map(lambda x: x[0], some_rows()))
     assert_array_equal(level.h, np.zeros((N_AGENTS, 16)))
     assert_array_equal(level.z, np.zeros((N_AGENTS, 12)))
+
+
+# --- centralised execution --------------------------------------------------------------------
+
+
+class Gossip(eqx.Module):
+    """A joint filter that remembers one number of each agent.
+
+    It is half of what it was, plus the sum of the first features of all the living, plus the index
+    of the agent's own last action, plus noise of the given size.
+    """
+
+    noise: float = 0.0
+    n_agents: int = eqx.field(static=True, default=N_AGENTS)
+    obs_dim: int = eqx.field(static=True, default=OBS)
+
+    def initial(self):
+        return jnp.zeros(self.n_agents)
+
+    def joint(self, memory, prev_action, obs, alive, key):
+        heard = (obs[:, 0] * alive).sum()
+        played = (prev_action * jnp.arange(4.0)[None]).sum(-1)
+        noise = jax.random.normal(key, memory.shape)
+        return 0.5 * memory + heard + played + self.noise * noise
+
+    def features(self, memory):
+        return memory[:, None]
+
+
+def tell(features, available):
+    """An actor that prefers action 1 to 0 by as much as its feature says, and no other to these."""
+    return MaskedCategorical.of(jnp.array([0.0, features[0], -99.0, -99.0]), available)
+
+
+def together(greedy: bool = True, noise: float = 0.0) -> JointExecutor:
+    return executor_of(Policy(Gossip(noise), tell), SPACE, greedy)
+
+
+def test_the_filter_decides_whether_agents_can_act_alone():
+    assert isinstance(build(), LocalExecutor)
+    assert isinstance(together(), JointExecutor)
+    assert build(greedy=True).greedy and together(greedy=True).greedy
+    assert not executor_of(Policy(Gossip(), tell), SPACE).greedy
+
+
+def test_a_team_remembers_together_by_hand():
+    rows = some_rows()
+    said = jnp.array([[1.0, 2.0, 4.0], [-8.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    obs = jnp.zeros((STEPS, N_AGENTS, OBS)).at[:, :, 0].set(said)
+    alive = jnp.array([[True] * 3, [True, True, False], [False, True, True], [True] * 3])
+    # Agent 2 may not play 1, nor anybody anything but 0 in the last row.
+    available = rows.available.at[:, 2, 1].set(False).at[3, :, 1].set(False)
+    is_first = jnp.arange(STEPS) % 3 == 0  # row 3 is a reset
+    rows = rows._replace(obs=obs, alive=alive, available=available, is_first=is_first)
+    memory, actions = play(together(), rows)
+    # Row 0: 1 + 2 + 4 = 7 for all, so that action 1 is likeliest, where available.
+    # Row 1: 7 / 2 - 8 = -4.5 (agent 2 is dead), and 1 more for those that played 1: action 0.
+    # Row 2: -3.5 / 2 + 2 = 0.25 (agent 0 is dead), -4.5 / 2 + 2 = -0.25 for agent 2, all having
+    # played 0: action 1 for agents 0 and 1, 0 for agent 2.
+    # Row 3: a reset, nothing to hear: zeros, although agents 0 and 1 had played 1.
+    assert_allclose(memory, [[7] * 3, [-3.5, -3.5, -4.5], [0.25, 0.25, -0.25], [0] * 3])
+    assert_array_equal(actions, [[1, 1, 0], [0, 0, 0], [1, 1, 0], [0, 0, 0]])
+    assert actions.dtype == jnp.int32
+
+
+def test_a_team_starts_from_its_filters_memory():
+    row = jax.tree.map(lambda x: x[0], some_rows())
+    assert_array_equal(together().initial(row), np.zeros(N_AGENTS))
+
+
+def test_a_team_draws_its_latents_and_each_agent_its_own_action():
+    row = jax.tree.map(lambda x: x[1], some_rows())._replace(obs=jnp.zeros((N_AGENTS, OBS)))
+    keys = jax.random.split(jax.random.key(0), 4000)
+
+    def act(executor):
+        return jax.jit(jax.vmap(lambda key: executor.act(executor.initial(row), row, key)))(keys)
+
+    # Every feature is 0: a fair coin between 0 and 1, tossed by each agent for itself.
+    row = row._replace(available=row.available.at[:, 2:].set(False))
+    memory, actions = act(together(greedy=False))
+    assert not memory.any()
+    assert_allclose(actions.mean(0), [0.5] * 3, atol=0.04)  # five standard errors
+    assert_allclose((actions[:, 0] == actions[:, 1]).mean(), 0.5, atol=0.04)
+    # With noise the key draws a latent, too: greedily, action 1 where it is positive.
+    memory, actions = act(together(noise=1.0))
+    assert_array_equal(actions, memory > 0)
+    assert_allclose(memory.std(), 1.0, atol=0.04)

@@ -9,16 +9,17 @@ import pytest
 from jaxtyping import Array
 from numpy.testing import assert_allclose, assert_array_equal
 
+from mabl.algorithms.base import Experience
 from mabl.algorithms.model_based import Learner, ModelBased, starts
 from mabl.algorithms.presets import preset
 from mabl.behaviour import mappo
 from mabl.behaviour.actor import MaskedCategorical
-from mabl.behaviour.mappo import MAPPOConfig
+from mabl.behaviour.mappo import MAPPO, ActorCritic, MAPPOConfig
 from mabl.envs.coordination import CoordinationEnv
 from mabl.imagination import imagine_trajectory
-from mabl.replay import Replay, sample_sequences
+from mabl.replay import sample_sequences
 from mabl.training.loop import Training
-from mabl.types import Trajectory
+from mabl.types import Replayed, TeamView, Trajectory
 from mabl.world_models.base import observe_sequence
 from mabl.world_models.mabl import MABL
 
@@ -35,8 +36,19 @@ def same(a, b) -> bool:
 
 
 @pytest.fixture(scope="module")
-def fresh() -> mappo.MAPPO:
-    return mappo.init(TINY, n_actor=5, n_critic=7, n_actions=4, key=jax.random.key(1))
+def fresh() -> ActorCritic:
+    return MAPPO(TINY).init(some_view(2), n_actions=4, key=jax.random.key(1))
+
+
+def some_view(*shape: int) -> TeamView:
+    """Random features of 5 and 7 for teams `shape` `[..., N]`; four actions, all alive."""
+    keys = jax.random.split(jax.random.key(5))
+    return TeamView(
+        actor_features=jax.random.normal(keys[0], (*shape, 5)),
+        critic_features=jax.random.normal(keys[1], (*shape, 7)),
+        available=jnp.ones((*shape, 4), bool),
+        alive=jnp.ones(shape, bool),
+    )
 
 
 # --- the policy -------------------------------------------------------------------------------
@@ -89,7 +101,7 @@ def reset_row():
 class ConstantCritic(NamedTuple):
     value: float
 
-    def __call__(self, features: Array) -> Array:
+    def __call__(self, features: Array, alive: Array) -> Array:
         return jnp.full(features.shape[0], self.value)
 
 
@@ -97,9 +109,12 @@ def two_steps() -> Trajectory:
     """Three rows, two transitions, one start, two agents; features show row and agent."""
     rows = jnp.arange(3.0)[:, None, None, None]
     return Trajectory(
-        actor_features=jnp.broadcast_to(rows, (3, 1, 2, 5)),
-        critic_features=jnp.broadcast_to(10 * rows, (3, 1, 2, 7)),
-        available=jnp.ones((3, 1, 2, 4), bool),
+        view=TeamView(
+            actor_features=jnp.broadcast_to(rows, (3, 1, 2, 5)),
+            critic_features=jnp.broadcast_to(10 * rows, (3, 1, 2, 7)),
+            available=jnp.ones((3, 1, 2, 4), bool).at[1, 0, 0, 3].set(False),
+            alive=jnp.array([[[True, True]], [[True, False]], [[False, False]]]),
+        ),
         action=jnp.array([[[0, 1]], [[2, 3]]]),
         log_prob=jnp.log(jnp.array([[[0.1, 0.2]], [[0.3, 0.4]]])),
         reward=jnp.array([[[1.0, 3.0]], [[2.0, 2.0]]]),
@@ -125,8 +140,10 @@ def test_experience_by_hand():
     assert_allclose(rows.weight, [[1, 1], [0.5, 0.5]])
     assert_array_equal(rows.action, [[0, 1], [2, 3]])
     assert_allclose(jnp.exp(rows.log_prob), [[0.1, 0.2], [0.3, 0.4]], rtol=1e-6)
-    assert_array_equal(rows.actor_features[:, 0, 0], [0, 1])
-    assert_array_equal(rows.critic_features[:, 0, 0], [0, 10])
+    assert_array_equal(rows.view.actor_features[:, 0, 0], [0, 1])
+    assert_array_equal(rows.view.critic_features[:, 0, 0], [0, 10])
+    assert_array_equal(rows.view.available[:, :, 3], [[True, True], [False, True]])
+    assert_array_equal(rows.view.alive, [[True, True], [True, False]])
     assert_allclose(metrics["behaviour/imagined_reward"], 2.0)
     assert_allclose(metrics["behaviour/value"], 2.0)
     assert_allclose(metrics["behaviour/imagined_return"], 2.53125)
@@ -138,10 +155,28 @@ def test_without_team_reward_every_agent_keeps_its_own():
     assert_allclose(rows.target, [[1.53125, 3.53125], [2.25, 2.25]])
 
 
+class HeadCount:
+    """The value of a team is how many of it are alive."""
+
+    def __call__(self, features: Array, alive: Array) -> Array:
+        return jnp.full(features.shape[0], alive.sum(dtype=jnp.float32))
+
+
+def test_the_critic_is_told_who_is_alive_in_each_row():
+    rows, metrics = mappo.experience(HeadCount(), two_steps(), BY_HAND)
+    # Values 2, 1 and 0. G_1 = 2 + 0.125 * 0 = 2, G_0 = 2 + 0.25 (0.5 * 1 + 0.5 * 2) = 2.375
+    assert_allclose(rows.target, [[2.375] * 2, [2.0] * 2])
+    assert_allclose(rows.advantage, [[0.375] * 2, [1.0] * 2])
+    assert_allclose(metrics["behaviour/value"], (2 * 1 + 1 * 0.5) / 1.5)
+    # Squared errors 0.375^2 and 1, weights 1 and 0.5: (0.140625 + 0.5) / 1.5 = 0.427083, half of it
+    loss, _ = mappo.critic_loss(HeadCount(), rows, 0.5)
+    assert_allclose(loss, 0.5 * 0.427083, rtol=1e-5)
+
+
 class RowCritic:
     """Values that tell which row they are of: 1, 2, 4, 8."""
 
-    def __call__(self, features: Array) -> Array:
+    def __call__(self, features: Array, alive: Array) -> Array:
         return 2.0 ** features[:, 0]
 
 
@@ -168,12 +203,25 @@ def test_replayed_values_by_hand(end, targets):
         truncated=jnp.zeros(4, bool).at[2].set(end == "truncated"),
     )
     features = jnp.broadcast_to(jnp.arange(4.0)[:, None, None], (4, 2, 7))
-    real = mappo.replayed_values(RowCritic(), features, rows, BY_HAND)
+    alive = jnp.arange(4)[:, None] + jnp.arange(2)[None] < 3
+    replayed = Replayed(some_view(4, 2)._replace(critic_features=features, alive=alive), rows)
+    real = mappo.replayed_values(RowCritic(), replayed, BY_HAND)
     assert_allclose(real.target, [[target] * 2 for target in targets])
     assert_array_equal(real.weight, [[1, 1], [1, 1], [end is None] * 2])
-    assert_array_equal(real.critic_features[:, 0, 0], [0, 1, 2])
-    alone = mappo.replayed_values(RowCritic(), features, rows, replace(BY_HAND, team_reward=False))
+    assert_array_equal(real.view.critic_features[:, 0, 0], [0, 1, 2])
+    assert_array_equal(real.view.alive, [[True, True], [True, True], [True, False]])
+    alone = mappo.replayed_values(RowCritic(), replayed, replace(BY_HAND, team_reward=False))
     assert_allclose(alone.target[0], [targets[0] - 1, targets[0] + 1])
+
+
+def test_replayed_values_are_told_who_is_alive_in_each_row():
+    rows = jax.tree.map(lambda x: jnp.zeros((3, *x.shape), x.dtype), reset_row())
+    rows = rows._replace(reward=jnp.full((3, 2), 2.0))
+    alive = jnp.array([[True, True], [True, False], [False, False]])
+    replayed = Replayed(some_view(3, 2)._replace(alive=alive), rows)
+    # Values 2, 1 and 0; G_1 = 2 + 0.5 * 0 = 2, G_0 = 2 + 0.5 (0.5 * 1 + 0.5 * 2) = 2.75
+    real = mappo.replayed_values(HeadCount(), replayed, BY_HAND)
+    assert_allclose(real.target, [[2.75] * 2, [2.0] * 2])
 
 
 def test_normalised_advantages_by_hand():
@@ -187,9 +235,12 @@ def random_trajectory(h: int, b: int, reward: Array | None = None) -> Trajectory
     keys = jax.random.split(jax.random.key(0), 6)
     shape = (h - 1, b, 2)
     return Trajectory(
-        actor_features=jax.random.normal(keys[0], (h, b, 2, 5)),
-        critic_features=jax.random.normal(keys[1], (h, b, 2, 7)),
-        available=jnp.ones((h, b, 2, 4), bool),
+        view=TeamView(
+            actor_features=jax.random.normal(keys[0], (h, b, 2, 5)),
+            critic_features=jax.random.normal(keys[1], (h, b, 2, 7)),
+            available=jnp.ones((h, b, 2, 4), bool),
+            alive=jnp.ones((h, b, 2), bool),
+        ),
         action=jax.random.randint(keys[2], shape, 0, 4),
         log_prob=jnp.full(shape, jnp.log(0.25)),
         reward=jax.random.normal(keys[3], shape) if reward is None else reward,
@@ -224,10 +275,10 @@ def test_a_start_of_weight_zero_never_counts():
 def test_losses_count_rows_by_their_weight(fresh):
     rows, _ = experience(BY_HAND, random_trajectory(3, 4))
     rows = rows._replace(weight=jnp.zeros_like(rows.weight).at[5, 1].set(0.3))
-    value = float(fresh.critic(rows.critic_features[5])[1])
+    value = float(fresh.critic(rows.view.critic_features[5], rows.view.alive[5])[1])
     loss, _ = mappo.critic_loss(fresh.critic, rows, 0.5)
     assert_allclose(loss, 0.5 * (value - float(rows.target[5, 1])) ** 2, rtol=1e-5)
-    policy = jax.vmap(fresh.actor)(rows.actor_features[5], rows.available[5])
+    policy = jax.vmap(fresh.actor)(rows.view.actor_features[5], rows.view.available[5])
     ratio = float(jnp.exp(policy.log_prob(rows.action[5]) - rows.log_prob[5])[1])
     loss, _ = mappo.actor_loss(fresh.actor, rows, jnp.float32(0.0), 9.0)  # nothing is clipped
     assert_allclose(loss, -ratio * float(rows.advantage[5, 1]), rtol=1e-5)
@@ -247,7 +298,7 @@ def test_zero_advantages_leave_the_actor_alone_while_the_critic_learns(fresh):
     after, _ = mappo.update(before, trajectory, jax.random.key(0), config)
     assert same(after.actor, before.actor)
     assert not same(after.critic, before.critic)
-    value = jax.vmap(after.critic)(trajectory.critic_features[0])
+    value = jax.vmap(after.critic)(trajectory.view.critic_features[0], trajectory.view.alive[0])
     assert (value > 0).all()  # on its way from 0 to 1
 
 
@@ -260,7 +311,8 @@ def test_advantages_move_the_actor_towards_the_better_action(fresh):
     config = replace(TINY, actor_learning_rate=1e-2, team_reward=False)
 
     def probability(actor):
-        policy = jax.vmap(jax.vmap(actor))(trajectory.actor_features[0], trajectory.available[0])
+        view = trajectory.view
+        policy = jax.vmap(jax.vmap(actor))(view.actor_features[0], view.available[0])
         return float(jnp.exp(policy.log_probs[..., 1]).mean())
 
     after, _ = mappo.update(fresh, trajectory, jax.random.key(0), config)
@@ -293,7 +345,11 @@ def test_the_entropy_bonus_alone_makes_the_policy_more_uniform(fresh):
 
 def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fresh):
     trajectory = random_trajectory(3, 4)
-    real = mappo.ValueRows(jnp.ones((6, 2, 7)), jnp.full((6, 2), 9.0), jnp.ones((6, 2)))
+    view = some_view(6, 2)._replace(critic_features=jnp.ones((6, 2, 7)))
+    real = mappo.ValueRows(view, jnp.full((6, 2), 9.0), jnp.ones((6, 2)))
+
+    def value(state):
+        return state.critic(view.critic_features[0], view.alive[0])
 
     def updated(coef, replayed):
         config = replace(TINY, replay_value_coef=coef)
@@ -306,10 +362,57 @@ def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fres
     )
     assert same(plain.actor, taught.actor)
     assert same(plain.critic, deaf.critic)
-    assert (taught.critic(real.critic_features[0]) > plain.critic(real.critic_features[0])).all()
+    assert (value(taught) > value(plain)).all()
     assert metrics["behaviour/replay_critic_loss"] > 10  # 0.5 (9 - about 0)^2, falling
     nothing = real._replace(weight=jnp.zeros((6, 2)))
     assert same(plain.critic, updated(1.0, nothing)[0].critic)
+
+
+def some_replayed(b: int, t: int) -> Replayed:
+    """Sequences `[B, T]` of one episode each, in which every row pays 1."""
+    blank = jax.tree.map(lambda x: jnp.zeros((b, t, *x.shape), x.dtype), reset_row())
+    return Replayed(some_view(b, t, 2), blank._replace(reward=jnp.ones((b, t, 2))))
+
+
+@pytest.mark.parametrize("coef", [0.0, 1.0])
+def test_the_behaviour_updates_from_the_values_of_replayed_rows_if_they_count(fresh, coef):
+    config = replace(TINY, replay_value_coef=coef)
+    trajectory, replayed, key = random_trajectory(3, 4), some_replayed(3, 5), jax.random.key(0)
+    after, metrics = MAPPO(config).update(fresh, trajectory, replayed, key)
+    # 3 sequences of 5 rows: 4 joint rows of each, side by side
+    sequences = [jax.tree.map(lambda x, b=b: x[b], replayed) for b in range(3)]
+    values = [mappo.replayed_values(fresh.critic, sequence, config) for sequence in sequences]
+    real = jax.tree.map(lambda *x: jnp.concatenate(x), *values)
+    assert real.target.shape == real.view.alive.shape == (12, 2)
+    expected, _ = mappo.update(fresh, trajectory, key, config, real if coef else None)
+    for x, y in zip(leaves(after), leaves(expected), strict=True):
+        assert_allclose(x, y, rtol=1e-4, atol=1e-6)
+    assert ("behaviour/replay_critic_loss" in metrics) == (coef > 0)
+
+
+def test_the_behaviour_offers_its_actor_its_value_and_all_that_a_model_has_for_critics(fresh):
+    behaviour, view = MAPPO(TINY), some_view(2)
+    assert behaviour.actor(fresh) is fresh.actor
+    for alive in ([True, True], [True, False]):
+        value = behaviour.value(fresh, view._replace(alive=jnp.array(alive)))
+        assert_array_equal(value, fresh.critic(view.critic_features, jnp.array(alive)))
+
+    class Doubling:
+        def critic_features(self, latent):
+            return 2 * latent
+
+    features = behaviour.critic_features(Doubling(), view.critic_features)
+    assert_array_equal(features, 2 * view.critic_features)
+
+
+def test_the_critic_hears_the_living_alone(fresh):
+    features = some_view(3).critic_features
+    moved = features.at[1].add(9.0)
+    dead, living = jnp.array([True, False, True]), jnp.ones(3, bool)
+    others = np.array([0, 2])
+    assert_array_equal(fresh.critic(features, dead)[others], fresh.critic(moved, dead)[others])
+    assert fresh.critic(features, dead)[1] != fresh.critic(moved, dead)[1]
+    assert (fresh.critic(features, living) != fresh.critic(moved, living)).all()
 
 
 # --- with a real world model ------------------------------------------------------------------
@@ -318,7 +421,7 @@ def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fres
 class Setting(NamedTuple):
     algorithm: ModelBased
     learner: Learner
-    replay: Replay
+    experience: Experience
 
 
 @pytest.fixture(scope="module")
@@ -337,17 +440,19 @@ def coordination() -> Setting:
             batch_size=4,
             batch_length=5,
         ),
-        mappo=replace(config.mappo, hidden=16, n_hidden=1, n_heads=2, n_starts=None),
+        mappo=replace(config.mappo, hidden=16, n_hidden=1, n_heads=2),
+        imagination=replace(config.imagination, n_starts=None),
     )
     env = CoordinationEnv()
-    algorithm = ModelBased(MABL, env.spec, config)
+    algorithm = ModelBased(MABL, MAPPO(config.mappo), env.spec, config)
     training = Training(env, algorithm)
 
     @eqx.filter_jit
     def begin(key):
         state = training.init(key)
         _, collected = training.collect(state.learner, state.collectors, key)
-        return state.learner, training.store(state.replay, collected)
+        replay = training.store(state.replay, collected)
+        return state.learner, Experience(replay, state.collectors, collected)
 
     return Setting(algorithm, *begin(jax.random.key(0)))
 
@@ -355,8 +460,7 @@ def coordination() -> Setting:
 @pytest.fixture(scope="module")
 def imagined(coordination) -> Trajectory:
     """Imagined trajectories, made as `update_policy` makes them."""
-    algorithm, learner, replay = coordination
-    config = algorithm.config
+    algorithm, learner, experience = coordination
 
     @eqx.filter_jit
     def imagine(learner, replay):
@@ -364,32 +468,24 @@ def imagined(coordination) -> Trajectory:
         latents, _ = jax.vmap(observe_sequence, in_axes=(None, 0, 0))(
             learner.model, rows, jax.random.split(jax.random.key(2), 4)
         )
-        start, available, weight = starts((latents, rows), jax.random.key(3), None)
-        trajectory = jax.vmap(
-            lambda start, available, weight, key: imagine_trajectory(
-                learner.model,
-                learner.behaviour.actor,
-                start,
-                available,
-                weight,
-                key,
-                config.mappo.horizon,
-                algorithm.spec.action_space,
-            ),
-            out_axes=1,
-        )(start, available, weight, jax.random.split(jax.random.key(4), 20))
-        return trajectory
+        start, weight = starts(latents, rows, jax.random.key(3), None)
+        dream = algorithm.dream(learner)
+        return jax.vmap(lambda *start: imagine_trajectory(dream, *start), out_axes=1)(
+            start, weight, jax.random.split(jax.random.key(4), 20)
+        )
 
-    return imagine(learner, replay)
+    return imagine(learner, experience.replay)
 
 
 def test_the_first_ppo_ratio_is_one(coordination, imagined):
     algorithm, learner, _ = coordination
-    horizon = algorithm.config.mappo.horizon
+    horizon = algorithm.config.imagination.horizon
     assert imagined.action.shape == (horizon - 1, 20, 2)
+    assert imagined.view.alive.shape == (horizon, 20, 2)
     config = algorithm.config.mappo
     rows, _ = mappo.experience(learner.behaviour.critic, imagined, config)
-    policy = jax.vmap(jax.vmap(learner.behaviour.actor))(rows.actor_features, rows.available)
+    view = rows.view
+    policy = jax.vmap(jax.vmap(learner.behaviour.actor))(view.actor_features, view.available)
     assert_allclose(jnp.exp(policy.log_prob(rows.action) - rows.log_prob), 1.0, atol=1e-5)
     _, metrics = mappo.actor_loss(
         learner.behaviour.actor, rows, jnp.float32(0.0), algorithm.config.mappo.clip
@@ -399,22 +495,26 @@ def test_the_first_ppo_ratio_is_one(coordination, imagined):
 
 
 def test_imagined_actions_were_available(imagined):
-    trajectory = imagined
-    taken = np.take_along_axis(
-        np.asarray(trajectory.available[:-1]), np.asarray(trajectory.action)[..., None], -1
-    )[..., 0]
-    none_available = ~np.asarray(trajectory.available[:-1]).any(-1)
+    available, action = np.asarray(imagined.view.available), np.asarray(imagined.action)
+    taken = np.take_along_axis(available[:-1], action[..., None], -1)[..., 0]
+    none_available = ~available[:-1].any(-1)
     assert (taken | none_available).all()
-    assert (np.asarray(trajectory.available[0]) == [True, True, True, False]).all()
+    assert (available[0] == [True, True, True, False]).all()
+
+
+def test_the_imagined_are_alive_at_the_start_and_nobody_comes_back(imagined):
+    alive = np.asarray(imagined.view.alive)
+    assert alive[0].all()  # as in the rows: nobody dies in this environment
+    assert (alive[1:] <= alive[:-1]).all()
 
 
 @pytest.mark.parametrize("replay_value_coef", [0.0, 1.0])
 def test_updating_the_policy_leaves_the_world_model_alone(coordination, replay_value_coef):
-    algorithm, learner, replay = coordination
-    config = algorithm.config
-    behaviour = replace(config.mappo, replay_value_coef=replay_value_coef)
-    algorithm = algorithm._replace(config=replace(config, mappo=behaviour))
-    after, metrics = eqx.filter_jit(algorithm.update_policy)(learner, replay, jax.random.key(0))
+    algorithm, learner, experience = coordination
+    config = replace(algorithm.config.mappo, replay_value_coef=replay_value_coef)
+    algorithm = algorithm._replace(behaviour=MAPPO(config))
+    update = eqx.filter_jit(algorithm.update_policy)
+    after, metrics = update(learner, experience, jax.random.key(0))
     assert same((learner.model, learner.model_opt), (after.model, after.model_opt))
     assert not same(learner.behaviour.actor, after.behaviour.actor)
     assert not same(learner.behaviour.critic, after.behaviour.critic)
@@ -423,8 +523,8 @@ def test_updating_the_policy_leaves_the_world_model_alone(coordination, replay_v
 
 
 def test_updating_the_model_leaves_actor_and_critic_alone(coordination):
-    algorithm, learner, replay = coordination
-    after, metrics = eqx.filter_jit(algorithm.update_model)(learner, replay, jax.random.key(0))
+    algorithm, learner, experience = coordination
+    after, metrics = eqx.filter_jit(algorithm.update_model)(learner, experience, jax.random.key(0))
     assert same(learner.behaviour, after.behaviour)
     pairs = zip(leaves(learner.model), leaves(after.model), strict=True)
     changed = [not np.array_equal(before, now) for before, now in pairs]

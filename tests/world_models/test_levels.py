@@ -3,7 +3,15 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mabl.world_models.levels import AgentFilter, Categoricals, Level, Recurrent, draw
+from mabl.world_models.levels import (
+    AgentFilter,
+    Categoricals,
+    Level,
+    Recurrent,
+    draw,
+    forget,
+    team_of,
+)
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
@@ -71,3 +79,27 @@ def test_the_filter_starts_from_zeros():
     start = AgentFilter(5, 2, 8, 3, 4, jax.random.key(0)).initial()
     assert_array_equal(start.h, np.zeros(8))
     assert_array_equal(start.z, np.zeros(12))
+
+
+def test_features_are_z_then_h():
+    level = Level(h=jnp.array([[1.0, 2.0]]), z=jnp.array([[0.0, 1.0, 0.0]]))
+    assert_array_equal(level.features(), [[0, 1, 0, 1, 2]])
+    agent = AgentFilter(5, 2, 8, 3, 4, jax.random.key(0))
+    own = Level(h=jnp.arange(8.0), z=jnp.eye(12)[2])
+    assert_array_equal(agent.features(own), np.concatenate([own.z, own.h]))
+    assert agent.obs_dim == 5
+
+
+def test_a_team_starts_with_what_one_agent_starts_with():
+    team = team_of(3, Level(h=jnp.arange(2.0), z=jnp.ones(1)))
+    assert_array_equal(team.h, [[0, 1]] * 3)
+    assert_array_equal(team.z, [[1]] * 3)
+
+
+def test_the_past_is_zeros_at_a_first_row_and_as_it_is_at_any_other():
+    past = (jnp.array([[1.0, 2.0]]), jnp.array([True]), jnp.array(3))
+    kept, gone = forget(past, jnp.bool_(False)), forget(past, jnp.bool_(True))
+    for x, y, z in zip(past, kept, gone, strict=True):
+        assert_array_equal(x, y)
+        assert_array_equal(z, np.zeros_like(x))
+        assert x.dtype == y.dtype == z.dtype

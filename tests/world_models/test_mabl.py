@@ -13,7 +13,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from mabl.envs.base import Continuous, Discrete, EnvSpec
 from mabl.losses.kl import balanced_kl
 from mabl.types import TimeStep
-from mabl.world_models.base import WorldModelConfig, model_loss, observe_sequence, reward_loss
+from mabl.world_models.base import (
+    WorldModelConfig,
+    decoder_losses,
+    model_loss,
+    observe_batch,
+    observe_sequence,
+    reward_loss,
+)
 from mabl.world_models.heads import Predictions
 from mabl.world_models.mabl import MABL
 
@@ -67,6 +74,7 @@ PARTS = (
     "agent_reward",
     "terminated",
     "available",
+    "alive",
     "action",
 )
 
@@ -74,6 +82,7 @@ PARTS = (
 @eqx.filter_jit
 def jacobian(model: MABL, rows: TimeStep) -> dict[str, dict[str, jax.Array]]:
     """Largest absolute gradient of each term of the loss in each part of the model."""
+    parts = [p for p in PARTS if p != "agent_reward" or model.config.reward_input == "both"]
 
     def terms(model: MABL) -> jax.Array:
         _, posterior, prior, predicted = observed(model, rows)
@@ -81,17 +90,17 @@ def jacobian(model: MABL, rows: TimeStep) -> dict[str, dict[str, jax.Array]]:
             balanced_kl(posterior[level], prior[level], 0.8, 0.2).sum()
             for level in ("agent", "global")
         ]
-        return jnp.stack(kl + [(getattr(predicted, part) ** 2).sum() for part in PARTS[2:]])
+        return jnp.stack(kl + [(getattr(predicted, part) ** 2).sum() for part in parts[2:]])
 
     gradient = eqx.filter_jacrev(terms)(model)
     return {
         part: {
             name: jnp.stack(
-                [jnp.abs(x[i]).max() for x in jax.tree.leaves(getattr(gradient, name))]
+                [jnp.abs(x[i]).max() for x in jax.tree.leaves(getattr(gradient.nets, name))]
             ).max()
             for name in (*GLOBAL, "filter", "heads")
         }
-        for i, part in enumerate(PARTS)
+        for i, part in enumerate(parts)
     }
 
 
@@ -137,8 +146,8 @@ def test_observation_loss_does_not_touch_the_global_level():
         assert norms[name] == 0, name
 
 
-@pytest.mark.parametrize("part", ["terminated", "available", "action"])
-def test_termination_availability_and_action_train_both_levels(part):
+@pytest.mark.parametrize("part", ["terminated", "available", "alive", "action"])
+def test_termination_availability_life_and_action_train_both_levels(part):
     norms = gradients()[part]
     for name in ("filter", "global_recurrent", "global_posterior", "state_encoder"):
         assert norms[name] > 0, name
@@ -159,6 +168,12 @@ def test_the_agents_own_reward_predictor_trains_the_agent_level_alone():
     assert norms["filter"] > 0
     for name in GLOBAL:
         assert norms[name] == 0, name
+
+
+def test_without_a_second_reward_predictor_there_is_no_reward_of_the_agents_own(model):
+    assert observed(model, some_rows(1))[-1].agent_reward is None
+    predicted = observed(build(reward_input="both"), some_rows(1))[-1]
+    assert (predicted.agent_reward != predicted.reward).all()
 
 
 @pytest.fixture(scope="module")
@@ -273,9 +288,9 @@ def test_imagined_agent_state_follows_the_imagined_global_state():
     for chosen in (0, 3):
         bias = big * jax.nn.one_hot(jnp.full(3, chosen), 4).ravel()
         rigged = eqx.tree_at(
-            lambda m: (m.global_prior, m.agent_prior),
+            lambda m: (m.nets.global_prior, m.nets.agent_prior),
             model,
-            (constant(model.global_prior, bias), copier(model.agent_prior)),
+            (constant(model.nets.global_prior, bias), copier(model.nets.agent_prior)),
         )
         z = rigged.imagine(rigged.initial(), jnp.zeros((3, 3)), jax.random.key(0)).agent.z
         assert_array_equal(z.reshape(3, 3, 4).argmax(-1), np.full((3, 3), chosen))
@@ -310,6 +325,21 @@ def test_features_are_the_agent_level_for_actors_and_both_levels_for_critics(mod
     )
     both = (latent.agent.z, latent.global_.z, latent.agent.h, latent.global_.h)
     assert_array_equal(model.critic_features(latent), np.concatenate(both, -1))
+    assert_array_equal(model.global_features(latent), latent.global_.z)
+
+
+def test_a_team_starts_from_zeros_at_both_levels_and_acts_by_its_filter(model):
+    start = model.initial()
+    for level in start:
+        assert_array_equal(level.h, np.zeros((3, 16)))
+        assert_array_equal(level.z, np.zeros((3, 12)))
+    assert model.filter is model.nets.filter
+
+
+def test_nothing_is_dropped_in_training(model):
+    rows, key = some_rows(3), jax.random.key(1)
+    both = (observe_sequence(model, rows, key, train) for train in (False, True))
+    jax.tree.map(assert_array_equal, *both)
 
 
 # --- model_loss -------------------------------------------------------------------------------
@@ -332,7 +362,8 @@ def batched(rows: TimeStep) -> TimeStep:
 
 def test_the_loss_is_the_sum_of_its_terms(losses_of):
     total, metrics = losses_of(batched(some_rows(4)))
-    names = ("obs", "reward", "terminated", "available", "action", "kl_agent", "kl_global")
+    decoded = ("obs", "reward", "terminated", "available", "alive", "action")
+    names = (*decoded, "kl_agent", "kl_global")
     terms = [float(metrics[f"world_model/loss_{name}"]) for name in names]
     assert {n for n in metrics if n.startswith("world_model/loss_")} == {
         f"world_model/loss_{name}" for name in names
@@ -351,10 +382,11 @@ def test_the_action_of_a_first_row_does_not_matter(losses_of):
 class Rigged(eqx.Module):
     """A model that decodes its latent: 0 from posteriors, 1 from priors.
 
-    It has one level, of two categoricals with known logits.
+    It has one level, of two categoricals with known logits, and a second reward predictor if told.
     """
 
     n_agents: int = eqx.field(static=True)
+    agent_reward: bool = eqx.field(static=True, default=False)
 
     def initial(self):
         return jnp.zeros(self.n_agents)
@@ -362,7 +394,7 @@ class Rigged(eqx.Module):
     def encode(self, row):
         return row.is_first
 
-    def observe(self, latent, inputs, key):
+    def observe(self, latent, inputs, key, train=False):
         return latent, {"level": self.logits([0.5, 0.5], [0.9, 0.1])}
 
     def prior(self, latent, key):
@@ -376,16 +408,18 @@ class Rigged(eqx.Module):
         return Predictions(
             obs=jnp.tile(latent[:, None], 4),
             reward=latent,
-            agent_reward=latent + 1.0,
+            agent_reward=latent + 1.0 if self.agent_reward else None,
             terminated=latent,
             available=jnp.tile(latent[:, None], 3),
+            alive=latent,
             action=jnp.tile(latent[:, None], 3),
         )
 
 
 def rigged_loss(rows: TimeStep, space=SPEC.action_space, **options) -> dict[str, float]:
     config = replace(CONFIG, **options)
-    _, metrics = model_loss(Rigged(3), rows, jax.random.key(0), config, space)
+    model = Rigged(3, config.reward_input == "both")
+    _, metrics = model_loss(model, rows, jax.random.key(0), config, space)
     return {k.removeprefix("world_model/loss_"): float(v) for k, v in metrics.items()}
 
 
@@ -402,6 +436,7 @@ def test_each_term_by_hand():
     assert_allclose(terms["reward"], 3.125 / 6, rtol=1e-5)
     assert_allclose(terms["terminated"], np.log(2), rtol=1e-5)
     assert_allclose(terms["available"], 3 * np.log(2), rtol=1e-5)  # summed over three actions
+    assert_allclose(terms["alive"], np.log(2), rtol=1e-5)
     assert_allclose(terms["action"], np.log(3) / 2, rtol=1e-5)  # not at the first row
     # Means over two categoricals of 0.143841 and 0.368064
     assert_allclose(terms["kl_level"], 0.255952, rtol=1e-5)
@@ -444,7 +479,9 @@ def test_overshooting_trains_the_decoders_on_what_the_prior_predicts():
         rtol=1e-5,
     )
     assert_allclose(terms["obs"], 2 * without["obs"], rtol=1e-5)
-    for name in ("reward", "terminated", "available", "action", "kl_level"):
+    # All alive: log(1 + 1/e)
+    assert_allclose(terms["ahead_alive"], 0.5 * np.log1p(1 / np.e), rtol=1e-5)
+    for name in ("reward", "terminated", "available", "alive", "action", "kl_level"):
         assert terms[name] == without[name], name
     assert not any(name.startswith("ahead") for name in without)
 
@@ -458,7 +495,8 @@ def test_overshooting_trains_both_priors_and_what_they_rest_on():
 
     gradient = eqx.filter_jit(eqx.filter_grad(ahead))(build(), some_rows(3))
     for name in (*GLOBAL, "filter", "agent_prior", "heads"):
-        assert max(jnp.abs(x).max() for x in jax.tree.leaves(getattr(gradient, name))) > 0, name
+        leaves = jax.tree.leaves(getattr(gradient.nets, name))
+        assert max(jnp.abs(x).max() for x in leaves) > 0, name
 
 
 def test_dead_agents_neither_teach_observations_nor_actions():
@@ -470,6 +508,62 @@ def test_dead_agents_neither_teach_observations_nor_actions():
     before, after = rigged_loss(batched(rows)), rigged_loss(batched(other))
     assert before == after
     assert_allclose(before["action"], np.log(3) / 6, rtol=1e-5)  # one of six entries counts
+
+
+def test_the_dead_do_teach_that_they_are_dead():
+    rows = some_rows(2)._replace(alive=jnp.array([[True, True, False], [True, False, False]]))
+    terms = rigged_loss(batched(rows), overshooting=1.0)
+    # Three of six alive: at logit 0 it makes no difference, at logit 1 log(1 + 1/e) for the living,
+    # log(1 + e) for the dead, in the mean 0.813262.
+    assert_allclose(terms["alive"], np.log(2), rtol=1e-5)
+    assert_allclose(terms["ahead_alive"], 0.813262, rtol=1e-5)
+
+
+def test_losses_of_the_decoders_are_told_by_row_and_agent():
+    rows = batched(some_rows(2))._replace(
+        obs=jnp.full((1, 2, 3, 4), 2.0),
+        reward=jnp.array([[[0.0, 1.0, 3.0], [1.0, 1.0, 1.0]]]),
+        terminated=jnp.array([[[True, False, False], [False, False, True]]]),
+        available=jnp.ones((1, 2, 3, 3), bool).at[0, 0, 1, 2].set(False),
+        alive=jnp.array([[[True, True, False], [True, False, True]]]),
+    )
+    predicted = jax.vmap(jax.vmap(Rigged(3, True).predict))(jnp.ones((1, 2, 3)))
+    config = replace(CONFIG, obs_weight=0.5, reward_weight=10.0, agent_reward_weight=0.1)
+    losses = decoder_losses(predicted, rows, config, SPEC.action_space)
+    # Everything predicted is 1, and 2 by the agent's own reward predictor. Logits of 1 cost
+    no, yes = np.log1p(np.e), np.log1p(1 / np.e)
+    expected = {
+        "obs": [[1, 1, 0], [1, 0, 1]],  # Huber of 1 four times, times 0.5; not of the dead
+        "reward": [[5, 0, 15], [0, 0, 0]],  # Huber of 1, 0, 2, times 10
+        "agent_reward": [[1.5, 0.5, 0.5], [0.5, 0.5, 0.5]],  # Huber of 2, 1, 1 and 1, 1, 1
+        "terminated": [[yes, no, no], [no, no, yes]],
+        "available": [[3 * yes, 2 * yes + no, 3 * yes], [3 * yes] * 3],
+        "alive": [[yes, yes, no], [yes, no, yes]],
+        "action": [[0, 0, 0], [np.log(3), 0, np.log(3)]],  # not at a first row, not of the dead
+    }
+    assert set(losses) == set(expected)
+    for name, values in expected.items():
+        assert_allclose(losses[name], [values], rtol=1e-5, err_msg=name)
+
+
+class Studious(Rigged):
+    """Its latent is 1 where it is observed to train."""
+
+    def observe(self, latent, inputs, key, train=False):
+        logits = super().observe(latent, inputs, key)[1]
+        return jnp.full_like(latent, train), logits
+
+
+def test_the_loss_alone_observes_to_train():
+    model, rows, key = Studious(3), some_rows(2), jax.random.key(0)
+    for train in (False, True):
+        assert (observe_sequence(model, rows, key, train)[0] == train).all()
+        assert (observe_batch(model, batched(rows), key, train).latents == train).all()
+    assert not observe_sequence(model, rows, key)[0].any()
+    assert not observe_batch(model, batched(rows), key).latents.any()
+    # All alive: log(1 + 1/e) at logit 1.
+    _, metrics = model_loss(model, batched(rows), key, CONFIG, SPEC.action_space)
+    assert_allclose(metrics["world_model/loss_alive"], np.log1p(1 / np.e), rtol=1e-5)
 
 
 def test_continuous_actions_are_regressed():

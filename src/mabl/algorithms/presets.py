@@ -106,16 +106,25 @@ _MAMBA_PAPER = {
     "world_model": {"learning_rate": 2e-4},
     "mappo": {"actor_learning_rate": 5e-4, "critic_learning_rate": 5e-4},
 }
+# Talking is slower to learn than listening to oneself.
+_MAMBA_TEST = {
+    "total_steps": 12_000,
+    "training": {"model_updates": 20},
+    "world_model": {"learning_rate": 1e-3},
+    "communication": {"n_layers": 1},
+    "mappo": {"ent_coef": 0.2},
+}
 # No model to train, and no rows kept beyond a cycle's.
 _ON_POLICY = {"model_updates": 0, "policy_updates": 1, "prefill_steps": 0, "pretrain_updates": 0}
 
-BY_ALGORITHM: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
+# The recipe's rollouts.
+_RECIPE = _ON_POLICY | {"num_envs": 8, "collect_steps": 400, "replay_capacity": 3_200}
+
+BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
     ("paper", "smax", "mamba"): _MAMBA_PAPER,
     ("paper", "smax", "mag"): _MAMBA_PAPER,
-    # The recipe's rollouts: 8 environments for 400 rows.
-    ("paper", "smax", "mappo"): {
-        "training": _ON_POLICY | {"num_envs": 8, "collect_steps": 400, "replay_capacity": 3_200},
-    },
+    ("paper", "smax", "mappo"): {"training": _RECIPE},
+    ("paper", "test", "mappo"): {"training": _RECIPE},
     ("quick", "smax", "mappo"): {
         "training": _ON_POLICY | {"num_envs": 16, "collect_steps": 64, "replay_capacity": 1_024},
         "recurrent_mappo": {
@@ -133,6 +142,9 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
             "epsilon_updates": 80,
         },
     },
+    ("quick", "test", "mamba"): _MAMBA_TEST,
+    ("quick", "test", "mag"): _MAMBA_TEST
+    | {"lookahead": {"candidates": 2, "steps": 2, "hidden": 64, "n_hidden": 2}},
     ("quick", "test", "mappo"): {
         "training": _ON_POLICY | {"num_envs": 16, "collect_steps": 40, "replay_capacity": 640},
         "recurrent_mappo": {"learning_rate": 2e-3, "n_epochs": 10},
@@ -146,7 +158,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, dict[str, Any]]] = {
         },
     },
 }
-"""What an algorithm changes in a preset of a family: sections' fields by (preset, family, algo)."""
+"""Fields that an algorithm changes, and fields of its sections, by (preset, family, algo)."""
 
 
 def preset(name: str, env: str, algo: str) -> Config:
@@ -162,9 +174,9 @@ def preset(name: str, env: str, algo: str) -> Config:
         raise registry.unknown(env)
     config = replace(families[family], env=env, algo=algo)
     changes = BY_ALGORITHM.get((name, family, algo), {})
-    config = replace(
-        config, **{key: replace(getattr(config, key), **new) for key, new in changes.items()}
-    )
+    for field, new in changes.items():
+        value = replace(getattr(config, field), **new) if isinstance(new, dict) else new
+        config = replace(config, **{field: value})
     if name == "paper" and env in PAPER_MODEL_LEARNING_RATE:
         rate = PAPER_MODEL_LEARNING_RATE[env]
         config = replace(config, world_model=replace(config.world_model, learning_rate=rate))

@@ -72,7 +72,8 @@ class EpsilonGreedy(eqx.Module):
         """The policy at one agent's features; where nothing is available, everything is."""
         may = available | ~available.any()
         best = jax.nn.one_hot(jnp.where(may, self.q(features), -jnp.inf).argmax(), may.shape[0])
-        probs = (1 - self.epsilon) * best + self.epsilon * may / may.sum()
+        epsilon = jnp.minimum(self.epsilon, 0.999)  # the best action stays the likeliest
+        probs = (1 - epsilon) * best + epsilon * may / may.sum()
         return MaskedCategorical.of(jnp.log(jnp.maximum(probs, 1e-20)), available)
 
 

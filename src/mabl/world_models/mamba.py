@@ -38,7 +38,7 @@ class CommunicationConfig:
 
     def __post_init__(self) -> None:
         require_positive(self, "n_layers", "n_heads")
-        require_between(self, 0, 1, "dropout")
+        require_between(self, 0, 0.9, "dropout")
 
 
 class Latent(NamedTuple):

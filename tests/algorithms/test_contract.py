@@ -1,0 +1,135 @@
+"""What every registered algorithm must do: a new one is tested as soon as it is registered."""
+
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from tests.tiny import flags, tiny
+
+from mabl import Policy, TeamPolicy, UserError, cli, preset
+from mabl.algorithms.registry import ALGORITHMS
+from mabl.runs.checkpoint import Checkpoints, named
+from mabl.training.run import build
+
+STEPS, MORE_STEPS = 400, 500
+
+EVERY = pytest.mark.parametrize(
+    # Tests of one algorithm share its compiled program, so they belong to one worker.
+    "algo",
+    [pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ALGORITHMS],
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compile_quickly():
+    """What little is computed here need not be fast."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """`run(algo)` is the folder of a short run, made once."""
+    done: dict[str, Path] = {}
+
+    def train(algo: str) -> Path:
+        if algo not in done:
+            done[algo] = train_to(STEPS, algo, tmp_path_factory.mktemp(algo))
+        return done[algo]
+
+    return train
+
+
+def train_to(steps: int, algo: str, logdir: Path) -> Path:
+    assert cli.run(["train", *flags(algo), f"--total-steps={steps}", f"--logdir={logdir}"]) == 0
+    (folder,) = logdir.glob(f"test/coordination/{algo}/seed_0/*")
+    return folder
+
+
+def metrics_of(folder: Path) -> list[dict]:
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if not k.startswith("time/")} for row in rows]
+
+
+def learner_of(folder: Path, algo: str) -> dict[str, np.ndarray]:
+    """All that learning changes, from the newest checkpoint, by name."""
+    shape = jax.eval_shape(build(tiny(algo)).init, jax.random.key(0))
+    state = Checkpoints(folder / "checkpoints").restore("state", shape)
+    return {name: np.asarray(leaf) for name, leaf in named(state.learner)}
+
+
+@EVERY
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(algo, run, tmp_path):
+    resumed = tmp_path / "resumed"
+    shutil.copytree(run(algo), resumed)
+    with (resumed / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 9999, "train/score": 1.0}\n{"step": 10')  # past the checkpoint; torn
+    assert cli.run(["resume", str(resumed), f"--total-steps={MORE_STEPS}"]) == 0
+    whole = train_to(MORE_STEPS, algo, tmp_path)
+    assert metrics_of(resumed) == metrics_of(whole)
+    assert metrics_of(whole)[-1]["step"] >= MORE_STEPS
+    one, other = learner_of(resumed, algo), learner_of(whole, algo)
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+@EVERY
+def test_learning_moves_every_parameter_and_keeps_them_finite(algo, run, tmp_path):
+    learned = metrics_of(run(algo))[-1]
+    assert learned["step"] >= STEPS and any(name.startswith("behaviour/") for name in learned)
+    assert all(value is not None and np.isfinite(value) for value in learned.values())
+    further = tmp_path / "further"
+    shutil.copytree(run(algo), further)
+    assert cli.run(["resume", str(further), f"--total-steps={MORE_STEPS}"]) == 0
+    before, after = learner_of(run(algo), algo), learner_of(further, algo)
+    assert all(np.isfinite(value).all() for value in after.values())
+    still = [n for n in before if before[n].size > 1 and np.array_equal(before[n], after[n])]
+    assert not still
+
+
+@EVERY
+def test_its_policy_is_evaluated_and_can_be_taken_away(algo, run, capsys):
+    folder = run(algo)
+    assert cli.run(["eval", str(folder), "--episodes=8", "--json"]) == 0
+    numbers = json.loads(capsys.readouterr().out)
+    assert numbers["episodes"] == 8 and 0 <= numbers["score"] <= 1
+
+    obs, available = np.zeros((2, 6), np.float32), np.array([[False, True, False, True]] * 2)
+    team = TeamPolicy.load(folder, greedy=False)
+    joint = np.stack([team.act(obs, available) for _ in range(20)])
+    assert set(joint.ravel()) == {1, 3}
+    with pytest.raises(UserError, match=r"obs has shape \(3, 6\), the policy expects \(2, 6\)"):
+        team.act(np.zeros((3, 6)))
+    if ALGORITHMS[algo].decentralised:
+        one = Policy.load(folder, greedy=False)
+        assert {one.act(obs[0], available[0]) for _ in range(20)} == {1, 3}
+    else:
+        with pytest.raises(UserError, match=f"{algo} executes centrally"):
+            Policy.load(folder)
+
+
+@EVERY
+def test_seeds_of_one_program_keep_their_shapes(algo):
+    """`test_cli.py` runs two seeds of MABL; whether others can is a matter of shapes."""
+    training = build(tiny(algo))
+    keys = jax.random.split(jax.random.key(0), 2)
+    states = jax.eval_shape(jax.vmap(training.init), keys)
+    cycle = jax.vmap(training.cycle, in_axes=(0, None, None))
+    after, metrics = jax.eval_shape(cycle, states, 1, 1)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(
+        lambda x: (x.shape, x.dtype), states
+    )
+    assert all(x.shape == (2,) for x in jax.tree.leaves(metrics))
+
+
+@EVERY
+@pytest.mark.parametrize("name", ["quick", "paper"])
+@pytest.mark.parametrize("env", ["smax/3m", "smax/2s3z", "test/coordination"])
+def test_every_preset_builds_it(algo, name, env):
+    config = preset(name, env, algo)
+    shape = jax.eval_shape(build(config).init, jax.random.key(0))
+    assert sum(x.size for x in jax.tree.leaves(shape.learner)) > 1000

@@ -1,0 +1,87 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+
+from mabl.nets.normaliser import Normaliser
+
+
+def after(*batches: list[float], decay: float = 0.9) -> Normaliser:
+    """A normaliser that has seen batches whose values all count alike."""
+    normaliser = Normaliser.fresh()
+    for batch in batches:
+        normaliser = normaliser.update(jnp.array(batch), jnp.ones(len(batch)), decay)
+    return normaliser
+
+
+def test_a_fresh_one_changes_nothing():
+    values = jnp.array([-1e6, 0.0, 0.25, 3.0])
+    assert_array_equal(Normaliser.fresh().normalise(values), values)
+    assert_array_equal(Normaliser.fresh().restore(values), values)
+
+
+def test_after_one_batch_moments_are_the_batchs_however_slowly_it_forgets():
+    # Mean of 1 and 3 is 2, of their squares 5; 5 - 2^2 = 1. What is kept is a tenth or a hundredth
+    # of it, and so is its weight.
+    for decay, share in ((0.9, 0.1), (0.99, 0.01), (0.0, 1.0)):
+        normaliser = after([1.0, 3.0], decay=decay)
+        assert_allclose(normaliser, [2 * share, 5 * share, share], rtol=1e-5)
+        assert_allclose(normaliser.moments(), [2, 1], rtol=1e-4)
+        assert_allclose(normaliser.normalise(jnp.array([1.0, 2.0, 5.0])), [-1, 0, 3], atol=1e-3)
+
+
+def test_two_batches_by_hand():
+    # 0.9 (0.1 * 2) + 0.1 * 6 = 0.78, 0.9 (0.1 * 5) + 0.1 * 36 = 4.05, 0.9 * 0.1 + 0.1 = 0.19.
+    # Mean 0.78 / 0.19 = 4.105263, mean square 21.315789; 21.315789 - 16.853186 = 4.462604,
+    # whose root is 2.112488.
+    normaliser = after([1.0, 3.0], [6.0])
+    assert_allclose(normaliser, [0.78, 4.05, 0.19], rtol=1e-5)
+    assert_allclose(normaliser.moments(), [4.105263, 2.112488], rtol=1e-5)
+    # (10 - 4.105263) / 2.112488 = 2.790424
+    assert_allclose(normaliser.normalise(jnp.array(10.0)), 2.790424, rtol=1e-5)
+
+
+def test_what_was_seen_long_ago_is_forgotten():
+    normaliser = after([1000.0, -1000.0], *[[1.0, 3.0]] * 200, decay=0.9)
+    assert_allclose(normaliser.weight, 1.0, rtol=1e-5)
+    assert_allclose(normaliser.moments(), [2, 1], rtol=1e-3)
+
+
+def test_restoring_inverts_normalising():
+    values = jax.random.normal(jax.random.key(0), (3, 4)) * 50.0
+    for normaliser in (Normaliser.fresh(), after([1.0, 3.0], [6.0, -40.0])):
+        assert_allclose(normaliser.restore(normaliser.normalise(values)), values, rtol=1e-5)
+        assert_allclose(
+            normaliser.normalise(normaliser.restore(values)), values, rtol=1e-5, atol=1e-5
+        )
+
+
+def test_values_of_weight_zero_do_not_count_and_others_count_by_theirs():
+    def seen(values: list[float], weights: list[float]) -> np.ndarray:
+        normaliser = Normaliser.fresh().update(jnp.array(values), jnp.array(weights), 0.9)
+        return np.array(normaliser)
+
+    assert_array_equal(
+        seen([1.0, 3.0, 99.0], [1.0, 1.0, 0.0]), seen([1.0, 3.0, -7.0], [1.0, 1.0, 0.0])
+    )
+    assert_allclose(
+        seen([1.0, 3.0, 99.0], [1.0, 1.0, 0.0]), seen([1.0, 3.0], [1.0, 1.0]), rtol=1e-6
+    )
+    # Mean (3 * 1 + 1 * 5) / 4 = 2, mean square (3 * 1 + 1 * 25) / 4 = 7, a tenth of each
+    assert_allclose(seen([1.0, 5.0], [3.0, 1.0]), [0.2, 0.7, 0.1], rtol=1e-5)
+
+
+def test_the_deviation_never_falls_below_a_tenth():
+    normaliser = after([5.0, 5.0])
+    assert_allclose(normaliser.moments(), [5, 0.1], rtol=1e-5)
+    assert_allclose(normaliser.normalise(jnp.array(6.0)), 10.0, rtol=1e-4)
+
+
+def test_it_passes_through_jit_and_scan():
+    values = jnp.array([[1.0, 3.0], [6.0, 6.0]])
+
+    def step(normaliser: Normaliser, batch: jax.Array):
+        return normaliser.update(batch, jnp.ones(2), 0.9), None
+
+    scanned, _ = jax.jit(lambda: jax.lax.scan(step, Normaliser.fresh(), values))()
+    assert_allclose(scanned, after([1.0, 3.0], [6.0]), rtol=1e-5)

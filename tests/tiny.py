@@ -1,0 +1,59 @@
+"""Every algorithm at a size at which a test can afford it."""
+
+from dataclasses import replace
+
+from mabl.algorithms.config import Config
+from mabl.algorithms.presets import preset
+from mabl.algorithms.registry import entry
+
+SIZES = {
+    "training": {
+        "num_envs": 2,
+        "collect_steps": 20,
+        "model_updates": 2,
+        "policy_updates": 1,
+        "replay_capacity": 400,
+        "diagnose_every": 300,
+    },
+    "world_model": {
+        "hidden": 16,
+        "n_hidden": 1,
+        "n_categoricals": 2,
+        "n_classes": 4,
+        "batch_size": 4,
+        "batch_length": 5,
+    },
+    "communication": {"n_layers": 1, "n_heads": 2},
+    "imagination": {"horizon": 4, "n_starts": 8},
+    "lookahead": {"candidates": 2, "steps": 2, "hidden": 8, "n_hidden": 1},
+    "mappo": {"hidden": 16, "n_hidden": 1, "n_heads": 2, "n_epochs": 2},
+    "qmix": {"hidden": 16, "n_hidden": 1, "mixer_hidden": 4, "hypernet_hidden": 4, "n_epochs": 2},
+    "recurrent_mappo": {"hidden": 16, "n_heads": 2, "n_epochs": 2, "chunk_length": 10},
+}
+LEARNING_STARTS = {"prefill_steps": 100, "pretrain_updates": 3}
+
+
+def tiny(algo: str, env: str = "test/coordination") -> Config:
+    """The `quick` preset of a test environment, made tiny in the sections that `algo` reads."""
+    config = preset("quick", env, algo)
+    sections = {name: SIZES[name] for name in entry(algo).sections}
+    if "world_model" in sections:
+        sections["training"] = sections["training"] | LEARNING_STARTS
+    else:
+        sections["training"] = sections["training"] | {"model_updates": 0}
+    return replace(
+        config, **{name: replace(getattr(config, name), **new) for name, new in sections.items()}
+    )
+
+
+def flags(algo: str) -> list[str]:
+    """The same as flags of `mabl train`."""
+    config, given = tiny(algo), [f"--algo={algo}", "--env=test/coordination"]
+    for name in entry(algo).sections:
+        section = getattr(config, name)
+        changed = SIZES[name] | (LEARNING_STARTS if name == "training" else {})
+        given += [
+            f"--{section.FLAG_PREFIX}{field.replace('_', '-')}={getattr(section, field)}"
+            for field in changed
+        ]
+    return given
