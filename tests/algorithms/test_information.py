@@ -143,7 +143,7 @@ def test_what_the_table_says_is_what_the_algorithm_does(algo, column):
 def test_agents_that_act_alone_first_differ_from_the_team_when_teammates_can_be_heard(algo):
     """The positive control: centralised ones hear of a teammate one step later, and not before."""
     rows = some_rows()
-    later = rows._replace(obs=rows.obs.at[1, 1].add(9.0))
+    later = with_obs(rows, rows.obs.at[1, 1:].multiply(-3.0))
     seen, heard = play(algo, rows)[0], play(algo, later)[0]
     assert_array_equal(seen[:2, 0], heard[:2, 0])
     assert (seen[2:, 0] != heard[2:, 0]).any() != ALGORITHMS[algo].decentralised

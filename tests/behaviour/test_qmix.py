@@ -1,6 +1,7 @@
 """QMIX by hand: the mixer, epsilon-greedy choice, double-Q targets, and what an update moves."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.tiny import tiny
 
 from mabl.algorithms.base import Experience
+from mabl.behaviour.actor import MaskedCategorical
 from mabl.behaviour.qmix import (
     QMIX,
     EpsilonGreedy,
@@ -91,18 +93,20 @@ def test_the_mixer_by_hand():
 @pytest.fixture(scope="module")
 def points():
     """A mixer, and many random values of three agents with features of a team."""
-    mixer = Mixer(n_agents=3, n_features=6, hidden=4, hypernet=8, key=jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1), 2)
-    q = jax.random.normal(keys[0], (500, 3))
-    return mixer, q, 2 * jax.random.normal(keys[1], (500, 3, 2))
+    mixer = eqx.filter_jit(lambda key: Mixer(3, 6, 4, 8, key))(jax.random.key(0))
+    rng = np.random.default_rng(0)
+    q, features = rng.normal(size=(500, 3)), 2 * rng.normal(size=(500, 3, 2))
+    return mixer, np.float32(q), np.float32(features)
 
 
 def test_the_mixer_never_falls_when_any_agents_value_rises(points):
     mixer, q, features = points
+    slope_of = jax.jit(lambda mixer: jax.vmap(jax.grad(mixer))(q, features))
+    rng = np.random.default_rng(1)
     # Weights that no initialisation gives count as well.
-    wild = jax.tree.map(lambda x: 3 * jax.random.normal(jax.random.key(x.size), x.shape), mixer)
+    wild = jax.tree.map(lambda x: np.float32(3 * rng.normal(size=x.shape)), mixer)
     for chosen, listens in ((mixer, 0.99), (wild, 0.5)):  # ELU dies out far below zero
-        slope = jax.jit(jax.vmap(jax.grad(chosen)))(q, features)
+        slope = np.asarray(slope_of(chosen))
         assert (slope >= 0).all()
         assert (slope > 0).mean() > listens
 
@@ -111,27 +115,26 @@ def test_the_global_features_weigh_agents_against_each_other_but_never_an_agents
     points,
 ):
     mixer, q, features = points
-    team = jax.vmap(mixer, in_axes=(None, 0))
+    every = jax.jit(jax.vmap(mixer))
+
+    def team(*values: float) -> np.ndarray:
+        """What these values are worth in every state."""
+        return np.asarray(every(np.float32([values] * 500), features))
+
     # With the same values, states are worth more or less ...
-    assert np.ptp(np.asarray(team(jnp.zeros(3), features))) > 0.1
+    assert np.ptp(team(0, 0, 0)) > 0.1
     # ... and whether it is better that agent 0 or that agent 1 has its way depends on the state.
-    prefers = team(jnp.array([1.0, 0.0, 0.0]), features) > team(
-        jnp.array([0.0, 1.0, 0.0]), features
-    )
-    assert 0.02 < prefers.mean() < 0.98
+    assert 0.02 < (team(1, 0, 0) > team(0, 1, 0)).mean() < 0.98
     # But agent 0's values 0, 0.5, 1, 1.5 are in this order everywhere, whatever the others' are.
-    own = jnp.stack(
-        [jnp.concatenate([jnp.full((500, 1), v), q[:, 1:]], axis=1) for v in (0, 0.5, 1, 1.5)]
-    )
-    ranked = jax.vmap(jax.vmap(mixer), in_axes=(0, None))(own, features)
-    steps = jnp.diff(ranked, axis=0)
+    own = [np.concatenate([np.full((500, 1), v, "f"), q[:, 1:]], 1) for v in (0, 0.5, 1, 1.5)]
+    steps = np.diff([np.asarray(every(values, features)) for values in own], axis=0)
     assert (steps >= 0).all() and (steps > 0).mean() > 0.99
 
 
 # --- the policy -------------------------------------------------------------------------------
 
 
-def values_of(*q: float) -> MLP:
+def constant(*q: float) -> MLP:
     """A network that gives these values whatever it sees."""
     net = MLP(2, len(q), 4, 1, jax.random.key(0))
     return eqx.tree_at(
@@ -139,6 +142,12 @@ def values_of(*q: float) -> MLP:
         net,
         [jnp.zeros((4, len(q))), jnp.array(q)],
     )
+
+
+@partial(jax.jit, static_argnums=0)
+def policy_of(q: tuple[float, ...], epsilon: float, available: Array) -> MaskedCategorical:
+    """Epsilon-greedy with these values."""
+    return EpsilonGreedy(constant(*q), jnp.float32(epsilon))(jnp.zeros(2), available)
 
 
 @pytest.mark.parametrize(
@@ -156,9 +165,8 @@ def values_of(*q: float) -> MLP:
     ],
 )
 def test_epsilon_greedy_by_hand(available, epsilon, probabilities):
-    actor = EpsilonGreedy(values_of(1.0, 3.0, 2.0), jnp.float32(epsilon))
-    policy = actor(jnp.zeros(2), jnp.array(available))
-    assert_allclose(jnp.exp(policy.log_probs), probabilities, rtol=1e-5, atol=1e-7)
+    policy = jax.device_get(policy_of((1.0, 3.0, 2.0), epsilon, np.array(available)))
+    assert_allclose(np.exp(policy.log_probs), probabilities, rtol=1e-5, atol=1e-7)
     assert np.isfinite(policy.log_probs).all()
     if any(available):  # what is not available is impossible, not just unlikely
         assert (np.exp(policy.log_probs)[~np.array(available)] == 0).all()
@@ -166,10 +174,9 @@ def test_epsilon_greedy_by_hand(available, epsilon, probabilities):
 
 @pytest.mark.parametrize("epsilon", [0.0, 0.05, 0.9])
 def test_the_mode_of_the_policy_is_greedy(epsilon):
-    actor = EpsilonGreedy(values_of(-5.0, -9.0, -1.0, -2.0), jnp.float32(epsilon))
     for available, best in (("1111", 2), ("1101", 3), ("1100", 0), ("0100", 1), ("0000", 2)):
-        policy = actor(jnp.zeros(2), jnp.array([x == "1" for x in available]))
-        assert policy.mode() == best
+        may = np.array([x == "1" for x in available])
+        assert policy_of((-5.0, -9.0, -1.0, -2.0), epsilon, may).mode() == best
 
 
 # --- experience -------------------------------------------------------------------------------
@@ -210,23 +217,29 @@ TARGET = Values(
 STATE = QState(ONLINE, TARGET, (), jnp.float32(0.5))
 
 
+def by_hand(trajectory: Trajectory, td_lambda: float) -> tuple[QRows, dict[str, Array]]:
+    """Rows and metrics of these networks with a discount of 0.8."""
+    config = replace(TINY, gamma=0.8, td_lambda=td_lambda)
+    return jax.device_get(jax.jit(lambda x: experience(STATE, x, config))(trajectory))
+
+
 def two_steps() -> Trajectory:
     """Three rows, two transitions, one start, two agents; actor features tell row and agent."""
-    number = jnp.arange(6.0).reshape(3, 1, 2, 1)
-    row = jnp.broadcast_to(jnp.arange(3.0)[:, None, None, None], (3, 1, 2, 1))
-    available = jnp.ones((3, 1, 2, 3), bool)
+    number = np.arange(6, dtype=np.float32).reshape(3, 1, 2, 1)
+    available = np.ones((3, 1, 2, 3), bool)
+    available[1, 0, 0, 2] = available[2, 0, 0] = False
     return Trajectory(
         TeamView(
             number,
-            row / 2,  # summed over the team: the row
-            available.at[1, 0, 0, 2].set(False).at[2, 0, 0].set(False),
-            jnp.ones((3, 1, 2), bool),
+            number // 2 / 2,  # summed over the team: the row
+            available,
+            np.ones((3, 1, 2), bool),
         ),
-        action=jnp.array([[[0, 1]], [[2, 1]]]),
-        log_prob=jnp.zeros((2, 1, 2)),
-        reward=jnp.array([[[1.0, 3.0]], [[0.0, 4.0]]]),
-        continues=jnp.array([[[0.5, 1.0]], [[0.5, 0.5]]]),
-        weight=jnp.array([[[1.0, 1.0]], [[0.5, 1.0]]]),
+        action=np.array([[[0, 1]], [[2, 1]]]),
+        log_prob=np.zeros((2, 1, 2), np.float32),
+        reward=np.array([[[1, 3]], [[0, 4]]], np.float32),
+        continues=np.array([[[0.5, 1]], [[0.5, 0.5]]], np.float32),
+        weight=np.array([[[1, 1]], [[0.5, 1]]], np.float32),
     )
 
 
@@ -243,7 +256,7 @@ def two_steps() -> Trajectory:
     [(0.0, [15.8, 10]), (1.0, [8, 10]), (0.5, [11.9, 10])],
 )
 def test_double_q_targets_by_hand(td_lambda, targets):
-    rows, metrics = experience(STATE, two_steps(), replace(TINY, gamma=0.8, td_lambda=td_lambda))
+    rows, metrics = by_hand(two_steps(), td_lambda)
     assert_allclose(rows.target, targets, rtol=1e-6)
     assert_allclose(rows.weight, [1, 0.75])
     assert_array_equal(rows.action, [[0, 1], [2, 1]])
@@ -258,15 +271,15 @@ def test_double_q_targets_by_hand(td_lambda, targets):
 @pytest.mark.parametrize("td_lambda", [0.0, 0.5, 1.0])
 def test_an_episodes_end_cuts_what_comes_after(td_lambda):
     trajectory = two_steps()
-    trajectory = trajectory._replace(continues=trajectory.continues.at[0].set(0.0))
-    rows, _ = experience(STATE, trajectory, replace(TINY, gamma=0.8, td_lambda=td_lambda))
+    trajectory.continues[0] = 0.0
+    rows, _ = by_hand(trajectory, td_lambda)
     assert_allclose(rows.target, [2, 10], rtol=1e-6)
 
 
 def test_several_starts_are_flattened_row_by_row():
-    trajectory = jax.tree.map(lambda x: jnp.concatenate([x, x], axis=1), two_steps())
-    trajectory = trajectory._replace(reward=trajectory.reward.at[:, 1].add(100.0))
-    rows, _ = experience(STATE, trajectory, replace(TINY, gamma=0.8, td_lambda=0.0))
+    trajectory = jax.tree.map(lambda x: np.concatenate([x, x], axis=1), two_steps())
+    trajectory.reward[:, 1] += 100.0
+    rows, _ = by_hand(trajectory, 0.0)
     # As above; the second start is paid 100 more each time
     assert_allclose(rows.target, [15.8, 115.8, 10, 110], rtol=1e-6)
     assert_array_equal(rows.action, [[0, 1], [0, 1], [2, 1], [2, 1]])
@@ -278,20 +291,21 @@ def test_targets_are_no_function_of_the_learned_networks_that_a_gradient_could_f
         state = STATE._replace(values=values)
         return experience(state, two_steps(), replace(TINY, td_lambda=0.5))[0].target.sum()
 
-    assert (jax.grad(total)(ONLINE.q.rows) == 0).all()
+    assert (jax.jit(jax.grad(total))(ONLINE.q.rows) == 0).all()
 
 
 def test_the_loss_by_hand():
     view = jax.tree.map(lambda x: x[1:, 0], two_steps().view)
-    rows = QRows(view, jnp.array([[0, 2], [1, 1]]), jnp.array([5.0, 6.0]), jnp.array([1.0, 0.5]))
+    loss_of = jax.jit(lambda rows: td_loss(ONLINE, rows))
+    rows = QRows(view, np.array([[0, 2], [1, 1]]), np.array([5.0, 6.0]), np.array([1.0, 0.5]))
     # Of row 1: 1 + 2 * 3 + 1 = 8, off by 3; of row 2: 1 + 2 * 0 + 2 = 3, off by -3.
     # 0.5 (1 * 9 + 0.5 * 9) / 1.5 = 4.5
-    loss, metrics = td_loss(ONLINE, rows)
+    loss, metrics = loss_of(rows)
     assert_allclose(loss, 4.5, rtol=1e-6)
     assert metrics["behaviour/critic_loss"] == loss
     # Weights of 1 and 0 leave the first, 4 off its target now: 0.5 * 16
-    rows = rows._replace(target=jnp.array([4.0, 1e6]), weight=jnp.array([1.0, 0.0]))
-    assert_allclose(td_loss(ONLINE, rows)[0], 8.0, rtol=1e-6)
+    rows = rows._replace(target=np.array([4.0, 1e6]), weight=np.array([1.0, 0.0]))
+    assert_allclose(loss_of(rows)[0], 8.0, rtol=1e-6)
 
 
 # --- updates ----------------------------------------------------------------------------------
@@ -310,25 +324,21 @@ class Game(NamedTuple):
 
 @pytest.fixture(scope="module")
 def bandit() -> Game:
-    keys = jax.random.split(jax.random.key(0), 3)
-    view = TeamView(
-        jnp.repeat(jax.random.normal(keys[0], (2, 4, 2, 4)), 9, axis=1),
-        jnp.repeat(jax.random.normal(keys[1], (2, 4, 2, 3)), 9, axis=1),
-        jnp.ones((2, 36, 2, 3), bool),
-        jnp.ones((2, 36, 2), bool),
-    )
-    action = jnp.array([list(product(range(3), repeat=2)) * 4])
+    rng = np.random.default_rng(0)
+    actor, critic = (np.float32(rng.normal(size=(2, 4, 2, n))).repeat(9, axis=1) for n in (4, 3))
+    view = TeamView(actor, critic, np.ones((2, 36, 2, 3), bool), np.ones((2, 36, 2), bool))
+    action = np.int32([list(product(range(3), repeat=2)) * 4])
     trajectory = Trajectory(
         view,
         action,
-        log_prob=jnp.zeros((1, 36, 2)),
-        reward=(action == 2).astype(jnp.float32),
-        continues=jnp.zeros((1, 36, 2)),
-        weight=jnp.ones((1, 36, 2)),
+        log_prob=np.zeros((1, 36, 2), np.float32),
+        reward=np.float32(action == 2),
+        continues=np.zeros((1, 36, 2), np.float32),
+        weight=np.ones((1, 36, 2), np.float32),
     )
     qmix = QMIX(TINY)
     first = jax.tree.map(lambda x: x[0, 0], view)
-    return Game(qmix, jax.jit(qmix.init, static_argnums=1)(first, 3, keys[2]), trajectory)
+    return Game(qmix, jax.jit(qmix.init, static_argnums=1)(first, 3, KEY), trajectory)
 
 
 @pytest.fixture(scope="module")
@@ -353,9 +363,15 @@ def test_updates_prefer_the_action_that_pays(bandit, update):
     qmix, state, trajectory = bandit
     view = jax.tree.map(lambda x: x[0], trajectory.view)
 
-    def lead(state: QState) -> Array:
+    @jax.jit
+    def values_of(state: QState) -> tuple[Array, Array]:
+        """Of all actions `[B, N, A]`, and Q_tot of those taken `[B]`."""
+        values = state.values
+        return jax.vmap(values.agents)(view), jax.vmap(values.chosen)(view, trajectory.action[0])
+
+    def lead(state: QState) -> np.ndarray:
         """By how much the paid action is above the better of the others, `[B, N]`."""
-        q = jax.vmap(state.values.agents)(view)
+        q = np.asarray(values_of(state)[0])
         return q[..., 2] - q[..., :2].max(-1)
 
     before = lead(state)
@@ -365,7 +381,7 @@ def test_updates_prefer_the_action_that_pays(bandit, update):
     assert (after > 0).all() and not (before > 0).all()
     # Q_tot has come near to what the joint action earns: 0, 1/2 or 1.
     earned = trajectory.reward[0].mean(-1)
-    total = jax.vmap(state.values.chosen)(view, trajectory.action[0])
+    total = np.asarray(values_of(state)[1])
     assert np.mean((total - earned) ** 2) < 0.02 < np.var(earned)
     assert_allclose(metrics["behaviour/imagined_reward"], trajectory.reward.mean(), rtol=1e-5)
 
@@ -401,8 +417,13 @@ def test_epsilon_falls_linearly_with_updates_and_stops_at_its_end(bandit, update
 
 def test_gradients_reach_every_parameter_of_the_agents_values_and_of_the_mixer(bandit):
     _, state, trajectory = bandit
-    rows, _ = experience(state, trajectory, TINY)
-    gradient, _ = eqx.filter_jit(eqx.filter_grad(td_loss, has_aux=True))(state.values, rows)
+
+    @jax.jit
+    def slope(state: QState) -> Values:
+        rows, _ = experience(state, trajectory, TINY)
+        return eqx.filter_grad(td_loss, has_aux=True)(state.values, rows)[0]
+
+    gradient = slope(state)
     for leaf in leaves(gradient):
         assert np.abs(leaf).max() > 0
 
@@ -410,15 +431,16 @@ def test_gradients_reach_every_parameter_of_the_agents_values_and_of_the_mixer(b
 def test_the_value_is_that_of_the_best_of_all_available_joint_actions(bandit):
     qmix, state, trajectory = bandit
     view = jax.tree.map(lambda x: x[0, 0], trajectory.view)
+    chosen, value = jax.jit(state.values.chosen), jax.jit(lambda view: qmix.value(state, view))
     for available in ([[True] * 3] * 2, [[True, False, True], [False, True, False]]):
-        view = view._replace(available=jnp.array(available))
+        view = view._replace(available=np.array(available))
         joint = [
-            float(state.values.chosen(view, jnp.array(action)))
+            float(chosen(view, np.int32(action)))
             for action in product(range(3), repeat=2)
             if all(view.available[i, a] for i, a in enumerate(action))
         ]
         assert len(set(joint)) == len(joint)
-        assert_allclose(qmix.value(state, view), [max(joint)] * 2, rtol=1e-5)
+        assert_allclose(value(view), [max(joint)] * 2, rtol=1e-5)
 
 
 # --- with a world model -----------------------------------------------------------------------

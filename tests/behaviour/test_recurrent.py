@@ -43,7 +43,7 @@ def test_unrolling_is_stepping_row_by_row_and_forgets_at_first_rows(memory_filte
     obs = jax.random.normal(jax.random.key(1), (7, 4))
     is_first = jnp.array([False, False, True, False, False, True, True])
     start = jax.random.normal(jax.random.key(2), (8,))
-    before, after = eqx.filter_jit(memory_filter.unroll)(start, obs, is_first)
+    before, after = jax.device_get(eqx.filter_jit(memory_filter.unroll)(start, obs, is_first))
     memory = start
     for t in range(7):
         if is_first[t]:
@@ -62,8 +62,9 @@ def test_unrolling_is_stepping_row_by_row_and_forgets_at_first_rows(memory_filte
 def test_nothing_from_before_a_first_row_is_remembered(memory_filter):
     obs = jax.random.normal(jax.random.key(1), (4, 4))
     is_first = jnp.array([False, False, True, False])
-    _, one = memory_filter.unroll(jnp.zeros(8), obs, is_first)
-    _, other = memory_filter.unroll(jnp.ones(8), obs.at[:2].add(1.0), is_first)
+    unroll = eqx.filter_jit(memory_filter.unroll)
+    _, one = jax.device_get(unroll(jnp.zeros(8), obs, is_first))
+    _, other = jax.device_get(unroll(jnp.ones(8), obs.at[:2].add(1.0), is_first))
     assert not np.isclose(one[:2], other[:2]).all(-1).any()
     assert_array_equal(one[2:], other[2:])
 
@@ -118,6 +119,7 @@ def play(env: str) -> tuple[ModelFree, PolicyLearner, list[Played]]:
     @jax.jit
     def run(key: Array) -> tuple:
         state = training.init(key)
+        state = state._replace(replay=None)  # nothing of it is learned from
         collectors, played = state.collectors, []
         for seed in (1, 2):
             key = jax.random.key(seed)
@@ -132,6 +134,7 @@ def play(env: str) -> tuple[ModelFree, PolicyLearner, list[Played]]:
         return state.learner, played
 
     learner, played = run(jax.random.key(0))
+    played = jax.device_get(played)
     for one, rows in played:  # the executor that we watched is the one that collected
         assert_array_equal(rows.prev_action, one.experience.newest.rows.prev_action)
         assert_array_equal(rows.obs, one.experience.newest.rows.obs)
@@ -143,32 +146,37 @@ def game(request):
     return play(request.param)
 
 
-def joined(chunks: Chunks, x: Array) -> np.ndarray:
+def joined(x: Array) -> np.ndarray:
     """Chunks `[M, L, ...]` as rows `[E, R, ...]` of the two environments again."""
     return np.asarray(x).reshape(2, ROWS, *x.shape[2:])
 
 
 def test_the_first_ppo_ratio_is_one(game):
     _, learner, played = game
-    filter, actor = learner.policy
-    unroll = jax.vmap(jax.vmap(filter.unroll, in_axes=(0, 1, None), out_axes=1))
+
+    @jax.jit
+    def recomputed(chunks: Chunks, memory: Array) -> tuple[Array, dict[str, Array]]:
+        """Log-probabilities of the actions, unrolled from a memory; metrics of the loss."""
+        filter, actor = learner.policy
+        unroll = jax.vmap(jax.vmap(filter.unroll, in_axes=(0, 1, None), out_axes=1))
+        _, memory = unroll(memory, chunks.obs, chunks.is_first)
+        now = policies(filter, actor, chunks.rows.view._replace(actor_features=memory))
+        metrics = recurrent_policy_loss(learner.policy, chunks, jnp.float32(0.0), 0.2)[1]
+        return now.log_prob(chunks.rows.action), metrics
+
     for one in played:
-        chunks, rows = one.chunks, one.chunks.rows
-        _, memory = unroll(chunks.memory, chunks.obs, chunks.is_first)
-        now = policies(filter, actor, rows.view._replace(actor_features=memory))
-        counts = joined(chunks, rows.weight) == 1
-        new, old = (joined(chunks, x) for x in (now.log_prob(rows.action), rows.log_prob))
+        chunks = one.chunks
+        counts, old = joined(chunks.rows.weight) == 1, joined(chunks.rows.log_prob)
+        log_prob, metrics = jax.device_get(recomputed(chunks, chunks.memory))
         # The chunks' own log-probabilities, and those with which the executor really acted
-        assert_allclose(np.exp(new - old)[counts], 1.0, atol=1e-5)
-        assert_allclose(np.exp(new - one.log_prob)[counts], 1.0, atol=1e-5)
+        assert_allclose(np.exp(joined(log_prob) - old)[counts], 1.0, atol=1e-5)
+        assert_allclose(np.exp(joined(log_prob) - one.log_prob)[counts], 1.0, atol=1e-5)
         assert np.std(old[counts]) > 0.1  # a policy with preferences
-        _, metrics = recurrent_policy_loss(learner.policy, chunks, jnp.float32(0.0), 0.2)
         assert metrics["behaviour/clip_fraction"] == 0
         assert_allclose(metrics["behaviour/approx_kl"], 0, atol=1e-6)
         # It would show if memories were missing: the policy depends on them.
-        _, memory = unroll(jnp.zeros_like(chunks.memory), chunks.obs, chunks.is_first)
-        blank = policies(filter, actor, rows.view._replace(actor_features=memory))
-        assert np.abs(joined(chunks, blank.log_prob(rows.action)) - old)[counts].max() > 1e-2
+        blank, _ = jax.device_get(recomputed(chunks, 0 * chunks.memory))
+        assert np.abs(joined(blank) - old)[counts].max() > 1e-2
 
 
 def test_chunks_begin_with_the_memory_that_the_executor_had_there(game):
@@ -184,7 +192,7 @@ def test_chunks_begin_with_the_memory_that_the_executor_had_there(game):
                 assert_allclose(memory[lane, chunk], expected, rtol=1e-4, atol=1e-5)
         in_mid_episode |= (one is played[1]) and not is_first[:, 0].all()
         # The policy's features at each row are the memory with which it acted there.
-        features = joined(one.chunks, one.chunks.rows.view.actor_features)
+        features = joined(one.chunks.rows.view.actor_features)
         assert_allclose(features, one.left, rtol=1e-4, atol=1e-5)
     assert in_mid_episode  # the second rollout goes on where the first one stopped
 
@@ -201,8 +209,8 @@ def test_an_action_is_paired_with_the_row_it_was_chosen_at(counted):
     *_, played = counted
     for one in played:
         chunks = one.chunks
-        t, agent, _, episode = np.moveaxis(joined(chunks, chunks.obs), -1, 0)
-        weight, action = joined(chunks, chunks.rows.weight), joined(chunks, chunks.rows.action)
+        t, agent, _, episode = np.moveaxis(joined(chunks.obs), -1, 0)
+        weight, action = joined(chunks.rows.weight), joined(chunks.rows.action)
         rows = one.experience.newest.rows
         # Rows start with the one that the rollout before left, and miss the newest.
         assert_array_equal(t[:, 0], one.experience.before.row.obs[..., 0])
@@ -218,18 +226,16 @@ def test_an_action_is_paired_with_the_row_it_was_chosen_at(counted):
         counts = weight == 1
         assert_array_equal(action[counts], np.asarray(rows.obs)[..., 2][counts])
         assert (action != t % 3)[counts].all()  # available at row t
-        assert_array_equal(
-            joined(chunks, chunks.rows.view.available), np.arange(3) != t[..., None] % 3
-        )
-        assert_array_equal(joined(chunks, chunks.is_first), (t == 0)[..., 0])
+        assert_array_equal(joined(chunks.rows.view.available), np.arange(3) != t[..., None] % 3)
+        assert_array_equal(joined(chunks.is_first), (t == 0)[..., 0])
 
 
 def test_critics_see_their_own_agents_observation_and_the_state(counted):
     *_, played = counted
     for one in played:
         chunks = one.chunks
-        features = joined(chunks, chunks.rows.view.critic_features)
-        obs = joined(chunks, chunks.obs)
+        features = joined(chunks.rows.view.critic_features)
+        obs = joined(chunks.obs)
         assert features.shape == (2, ROWS, 2, 4 + 2)
         assert_array_equal(features[..., :4], obs)
         assert_array_equal(features[..., 4:], obs[..., [0, 3]])  # (t, episode)
@@ -250,11 +256,12 @@ def test_returns_on_the_counting_environment_with_a_constant_critic(counted):
         critic=lambda features, alive: jnp.full(features.shape[0], 4.0),
         returns=Normaliser(jnp.float32(4), jnp.float32(17), jnp.float32(1)),
     )
+    constant = jax.jit(lambda experience: algorithm.chunks(learner, experience))
     ends = set()
     for one in played:
-        chunks, _ = jax.jit(lambda one=one: algorithm.chunks(learner, one.experience))()
+        chunks, _ = jax.device_get(constant(one.experience))
         rows = jax.tree.map(np.asarray, one.experience.newest.rows)
-        target, weight = joined(chunks, chunks.rows.target), joined(chunks, chunks.rows.weight)
+        target, weight = joined(chunks.rows.target), joined(chunks.rows.weight)
         scale = config.training.reward_scale
         for lane in range(2):
             later = 8.0
@@ -281,7 +288,7 @@ def fresh() -> PolicyLearner:
     """Any learner: what is computed by hand depends on its critic alone."""
     config = tiny("mappo", "test/counting")
     config = replace(config, recurrent_mappo=replace(config.recurrent_mappo, hidden=8))
-    return jax.jit(ModelFree(CountingEnv.spec, config).init)(jax.random.key(0))
+    return eqx.filter_jit(ModelFree(CountingEnv.spec, config).init)(jax.random.key(0))
 
 
 def by_hand(end: str | None = None, **options) -> tuple[Chunks, dict[str, float]]:
@@ -297,28 +304,27 @@ def by_hand(end: str | None = None, **options) -> tuple[Chunks, dict[str, float]
         training=replace(config.training, collect_steps=4),
         recurrent_mappo=replace(config.recurrent_mappo, **options),
     )
-    algorithm = ModelFree(CountingEnv.spec, config)
     _, row = CountingEnv().reset(jax.random.key(0))
-    rows: TimeStep = jax.tree.map(lambda x: jnp.zeros((1, 5, *x.shape), x.dtype), row)
-    rows = rows._replace(
-        state=jnp.zeros((1, 5, 2)).at[0, :, 0].set(jnp.arange(5.0)),
-        is_first=jnp.zeros((1, 5), bool).at[0, 3].set(end is not None),
-        terminated=jnp.zeros((1, 5, 2), bool).at[0, 2].set(end == "terminated"),
-        truncated=jnp.zeros((1, 5), bool).at[0, 2].set(end == "truncated"),
-        reward=jnp.array([[[50.0, 50.0], [1.0, 3.0], [6.0, 6.0], [9.0, 9.0], [1.0, 1.0]]]),
-        available=jnp.ones((1, 5, 2, 3), bool),
-        alive=jnp.ones((1, 5, 2), bool).at[0, 1, 1].set(False),
-    )
-    if end:
-        rows = rows._replace(reward=rows.reward.at[0, 3].set(0.0))
+    rows: TimeStep = jax.tree.map(lambda x: np.zeros((1, 5, *x.shape), x.dtype), row)
+    rows.state[0, :, 0] = np.arange(5)
+    rows.available[:], rows.alive[:] = True, True
+    rows.alive[0, 1, 1] = False
+    rows.reward[0] = [[50, 50], [1, 3], [6, 6], [0 if end else 9] * 2, [1, 1]]
+    rows.is_first[0, 3] = end is not None
+    rows.terminated[0, 2], rows.truncated[0, 2] = end == "terminated", end == "truncated"
+    return jax.device_get(chunks_of(ModelFree(CountingEnv.spec, config), fresh(), rows))
+
+
+@eqx.filter_jit
+def chunks_of(algorithm: ModelFree, learner: PolicyLearner, rows: TimeStep) -> tuple:
+    """Of rows `[1, 5, ...]`, with 2^row as the critic's value; nothing is remembered before."""
     first, rest = (jax.tree.map(lambda x, at=at: x[:, at], rows) for at in (0, slice(1, None)))
     nobody = jnp.zeros(1)
     before = Collector(None, first, jnp.zeros((1, 2, 8)), nobody, nobody)
     newest = Rollout(rest, Episodes(*[nobody] * 4), jnp.array([4]))
-    learner = fresh()
     # The state's first number is the row; features are 4 of the observation, then the state.
     learner = learner._replace(critic=lambda features, alive: 2.0 ** features[:, 4])
-    return jax.jit(lambda: algorithm.chunks(learner, Experience(None, before, newest)))()
+    return algorithm.chunks(learner, Experience(None, before, newest))
 
 
 TARGETS = {
@@ -383,7 +389,9 @@ def test_the_critics_loss_by_hand():
     rows = PPORows(view, unused, unused, unused, target, weight)
     # Normalised targets 1, 1; 0, 2; 14: errors 0, 0; 1, -1; -13. Half the squares 0, 0; 0.5, 0.5;
     # the last is beyond 10: 10 (13 - 5) = 80. 0.5 (2 * 0.5 + 0.5 + 80) / 6 = 6.791667
-    loss, metrics = value_loss(lambda features, alive: features[:, 0], rows, returns, 0.5)
+    loss, metrics = jax.jit(
+        lambda rows: value_loss(lambda features, alive: features[:, 0], rows, returns, 0.5)
+    )(rows)
     assert_allclose(loss, 6.791667, rtol=1e-6)
     assert metrics["behaviour/critic_loss"] == loss
 
@@ -395,7 +403,8 @@ def test_gradients_flow_back_through_time_within_a_chunk(counted):
     _, learner, played = counted
     chunk = jax.tree.map(lambda x: x[:1], played[1].chunks)
     rows = chunk.rows._replace(
-        weight=jnp.zeros((1, LENGTH, 2)).at[0, -1, 0].set(1.0), advantage=jnp.ones((1, LENGTH, 2))
+        weight=np.float32(np.arange(2 * LENGTH) == 2 * LENGTH - 2).reshape(1, LENGTH, 2),
+        advantage=np.ones((1, LENGTH, 2), np.float32),
     )
     chunk = chunk._replace(rows=rows)
 
@@ -410,11 +419,11 @@ def test_gradients_flow_back_through_time_within_a_chunk(counted):
         by_obs, by_memory = jax.grad(loss, argnums=(0, 1))(chunk.obs, chunk.memory)
         return jnp.abs(by_obs[0]).max(-1), jnp.abs(by_memory[0]).max(-1)
 
-    by_obs, by_memory = influence(jnp.zeros((1, LENGTH), bool))
+    by_obs, by_memory = jax.device_get(influence(np.zeros((1, LENGTH), bool)))
     assert (by_obs[:, 0] > 0).all() and by_memory[0] > 0
     assert (by_obs[:, 1] == 0).all() and by_memory[1] == 0  # a teammate's do not matter
     # Not across a reset
-    by_obs, by_memory = influence(jnp.zeros((1, LENGTH), bool).at[0, 2].set(True))
+    by_obs, by_memory = jax.device_get(influence(np.arange(LENGTH)[None] == 2))
     assert (by_obs[2:, 0] > 0).all() and (by_obs[:2] == 0).all() and (by_memory == 0).all()
 
 

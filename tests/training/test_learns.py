@@ -11,7 +11,7 @@ from mabl.evaluation import evaluate
 from mabl.execution import RandomExecutor
 from mabl.training.run import build, updates_due
 
-LAST_EPISODES, FIRST_EPISODES = 300, 100
+LAST_EPISODES, FIRST_EPISODES = 300, 200
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
