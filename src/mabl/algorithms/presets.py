@@ -125,6 +125,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
     ("paper", "smax", "mag"): _MAMBA_PAPER,
     ("paper", "smax", "mappo"): {"training": _RECIPE},
     ("paper", "test", "mappo"): {"training": _RECIPE},
+    ("quick", "smax", "mag"): {"lookahead": {"steps": 3, "hidden": 128, "n_hidden": 2}},
     ("quick", "smax", "mappo"): {
         "training": _ON_POLICY | {"num_envs": 16, "collect_steps": 64, "replay_capacity": 1_024},
         "recurrent_mappo": {
