@@ -409,21 +409,25 @@ def test_gradients_flow_back_through_time_within_a_chunk(counted):
     chunk = chunk._replace(rows=rows)
 
     @jax.jit
-    def influence(is_first: Array) -> tuple[Array, Array]:
+    def influence(chunk: Chunks) -> tuple[Array, Array]:
         """Of each row's observations and of the memory on the loss of agent 0's last row."""
 
         def loss(obs: Array, memory: Array) -> Array:
-            seen = chunk._replace(obs=obs, memory=memory, is_first=is_first)
+            seen = chunk._replace(obs=obs, memory=memory)
             return recurrent_policy_loss(learner.policy, seen, jnp.float32(0.0), 0.2)[0]
 
         by_obs, by_memory = jax.grad(loss, argnums=(0, 1))(chunk.obs, chunk.memory)
         return jnp.abs(by_obs[0]).max(-1), jnp.abs(by_memory[0]).max(-1)
 
-    by_obs, by_memory = jax.device_get(influence(np.zeros((1, LENGTH), bool)))
+    by_obs, by_memory = jax.device_get(
+        influence(chunk._replace(is_first=np.zeros((1, LENGTH), bool)))
+    )
     assert (by_obs[:, 0] > 0).all() and by_memory[0] > 0
     assert (by_obs[:, 1] == 0).all() and by_memory[1] == 0  # a teammate's do not matter
     # Not across a reset
-    by_obs, by_memory = jax.device_get(influence(np.arange(LENGTH)[None] == 2))
+    by_obs, by_memory = jax.device_get(
+        influence(chunk._replace(is_first=np.arange(LENGTH)[None] == 2))
+    )
     assert (by_obs[2:, 0] > 0).all() and (by_obs[:2] == 0).all() and (by_memory == 0).all()
 
 

@@ -133,6 +133,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
             "n_epochs": 10,
             "n_minibatches": 2,
             "chunk_length": 16,
+            "ent_coef": 0.003,
         },
     },
     ("quick", "smax", "mabl-qmix"): {
@@ -140,7 +141,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
             "hidden": 128,
             "learning_rate": 1e-3,
             "batch_size": 500,
-            "epsilon_updates": 80,
+            "epsilon_updates": 40,
         },
     },
     ("quick", "test", "mamba"): _MAMBA_TEST,
