@@ -13,8 +13,9 @@ from jaxtyping import Array
 from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
 from mabl.behaviour.actor import Actor
+from mabl.behaviour.base import minibatches
 from mabl.behaviour.critic import Critic
-from mabl.behaviour.mappo import PPORows
+from mabl.behaviour.mappo import PPORows, real_returns
 from mabl.behaviour.recurrent import (
     Chunks,
     RecurrentFilter,
@@ -25,10 +26,9 @@ from mabl.behaviour.recurrent import (
 from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
 from mabl.execution import Policy
-from mabl.losses.returns import lambda_returns
 from mabl.nets.normaliser import Normaliser
 from mabl.replay import Replay
-from mabl.types import Metrics, PRNGKey, TeamView, TimeStep, is_last
+from mabl.types import Metrics, PRNGKey, TeamView, TimeStep
 
 
 class PolicyLearner(NamedTuple):
@@ -107,12 +107,13 @@ class ModelFree:
         """`n_epochs` of minibatch PPO on the rows that the present policy has just collected."""
         config = self.config.recurrent_mappo
         chunks, metrics = self.chunks(learner, experience)
-        n_chunks = chunks.memory.shape[0]
         targets, weights = chunks.rows.target, chunks.rows.weight
         learner = learner._replace(
             returns=learner.returns.update(targets, weights, config.value_decay)
         )
+        n_chunks = chunks.memory.shape[0]
         size = max(n_chunks // config.n_minibatches, 1)
+        batches = minibatches(key, n_chunks, size, config.n_epochs)
         optimiser = self._optimiser()
 
         def minibatch(learner: PolicyLearner, index: Array) -> tuple[PolicyLearner, Metrics]:
@@ -133,20 +134,13 @@ class ModelFree:
             )
             return learner, policy_metrics | critic_metrics
 
-        def shuffled(key: PRNGKey) -> Array:
-            order = jax.random.permutation(key, n_chunks)[: n_chunks // size * size]
-            return rearrange(order, "(m b) -> m b", b=size)
-
-        batches = jax.vmap(shuffled)(jax.random.split(key, config.n_epochs))
-        learner, history = jax.lax.scan(minibatch, learner, rearrange(batches, "e m b -> (e m) b"))
+        learner, history = jax.lax.scan(minibatch, learner, batches)
         return learner, metrics | jax.tree.map(jnp.mean, history)
 
     def chunks(self, learner: PolicyLearner, experience: Experience) -> tuple[Chunks, Metrics]:
         """The newest rows with their memories, log-probabilities, returns and advantages.
 
-        Rows start with the one at which the first new action was chosen. From an episode's last row
-        to the next reset nothing passes: that step weighs nothing and hands back the last row's
-        value, so that truncated episodes bootstrap.
+        Rows start with the one at which the first new action was chosen.
         """
         config = self.config.recurrent_mappo
         rows = jax.tree.map(
@@ -159,16 +153,11 @@ class ModelFree:
         view = TeamView(after, critic_features(rows), rows.available, rows.alive)
         value = jax.vmap(jax.vmap(learner.critic))(view.critic_features, view.alive)
         value = learner.returns.restore(value)
-        ends = is_last(rows)[:, :-1, None]
-        reward = rows.reward[:, 1:]
-        if config.team_reward:
-            reward = jnp.broadcast_to(reward.mean(-1, keepdims=True), reward.shape)
-        reward = jnp.where(ends, value[:, :-1], reward)
-        discount = config.gamma * (1.0 - (rows.terminated[:, 1:] | ends))
-        target = jax.vmap(lambda_returns, in_axes=(0, 0, 0, None))(
-            reward, discount, value[:, 1:], config.gae_lambda
-        )
-        weight = jnp.broadcast_to(1.0 - ends, target.shape)
+        target, weight = jax.vmap(
+            lambda value, rows: real_returns(
+                value, rows, config.gamma, config.gae_lambda, config.team_reward
+            )
+        )(value, rows)
         advantage = target - value[:, :-1]
         counted = weight * rows.alive[:, :-1]
         mean = (counted * advantage).sum() / counted.sum()

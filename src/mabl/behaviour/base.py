@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
-from jaxtyping import Array, Bool, Float
+import jax
+from einops import rearrange
+from jaxtyping import Array, Bool, Float, Int
 
 from mabl.behaviour.actor import MaskedCategorical
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
@@ -41,3 +43,18 @@ class Behaviour(Protocol[S]):
     ) -> tuple[S, Metrics]:
         """Learn from trajectories of the present policy, and from the sequences they began in."""
         ...
+
+
+def minibatches(key: PRNGKey, n_rows: int, batch_size: int, n_epochs: int) -> Int[Array, "M B"]:
+    """Indices of the minibatches of `n_epochs` shuffles of `n_rows`, one after the other.
+
+    A minibatch has all rows if there are fewer than `batch_size`; what is left over of a shuffle
+    after full minibatches is left out of that epoch.
+    """
+    size = min(batch_size, n_rows)
+
+    def shuffled(key: PRNGKey) -> Int[Array, "m B"]:
+        order = jax.random.permutation(key, n_rows)[: n_rows // size * size]
+        return rearrange(order, "(m b) -> m b", b=size)
+
+    return rearrange(jax.vmap(shuffled)(jax.random.split(key, n_epochs)), "e m b -> (e m) b")

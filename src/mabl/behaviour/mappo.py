@@ -13,11 +13,12 @@ from einops import rearrange
 from jaxtyping import Array, Bool, Float
 
 from mabl.behaviour.actor import Actor, MaskedCategorical
+from mabl.behaviour.base import minibatches
 from mabl.behaviour.critic import Critic
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.ppo import clipped_surrogate
 from mabl.losses.returns import lambda_returns
-from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
+from mabl.types import Metrics, PRNGKey, Replayed, TeamView, TimeStep, Trajectory
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ def experience(
     critic: ValueFunction, trajectory: Trajectory, config: MAPPOConfig
 ) -> tuple[PPORows, Metrics]:
     """Lambda-returns and advantages of trajectories, flattened to joint rows."""
-    weight, reward = trajectory.weight, shared_reward(trajectory.reward, config)
+    weight, reward = trajectory.weight, shared_reward(trajectory.reward, config.team_reward)
     view = trajectory.view
     value = jax.vmap(jax.vmap(critic))(view.critic_features, view.alive)
     target = lambda_returns(
@@ -212,30 +213,41 @@ def experience(
     return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
 
 
-def shared_reward(reward: Float[Array, "*b N"], config: MAPPOConfig) -> Float[Array, "*b N"]:
-    """The team's mean reward for every agent, where `config.team_reward` says so."""
-    if not config.team_reward:
+def shared_reward(reward: Float[Array, "*b N"], team_reward: bool) -> Float[Array, "*b N"]:
+    """The team's mean reward for every agent, or to each its own."""
+    if not team_reward:
         return reward
     return jnp.broadcast_to(reward.mean(-1, keepdims=True), reward.shape)
 
 
 def replayed_values(critic: ValueFunction, replayed: Replayed, config: MAPPOConfig) -> ValueRows:
-    """Lambda-returns along one real sequence `[T, ...]`, whoever acted in it (ADR 8).
+    """Lambda-returns along one real sequence `[T, ...]`, whoever acted in it (ADR 8)."""
+    view, rows = replayed
+    value = jax.vmap(critic)(view.critic_features, view.alive)
+    target, weight = real_returns(value, rows, config.gamma, config.gae_lambda, config.team_reward)
+    return ValueRows(jax.tree.map(lambda x: x[:-1], view), target, weight)
+
+
+def real_returns(
+    value: Float[Array, "T N"],
+    rows: TimeStep,
+    gamma: float,
+    gae_lambda: float,
+    team_reward: bool,
+) -> tuple[Float[Array, "T-1 N"], Float[Array, "T-1 N"]]:
+    """Lambda-returns of one real sequence's rows but the last, and how much they count.
 
     From an episode's last row to the next reset nothing passes: that step weighs nothing and hands
     back the last row's value, so that truncated episodes bootstrap.
     """
-    view, rows = replayed
-    value = jax.vmap(critic)(view.critic_features, view.alive)
     ends = rows.is_first[1:, None]
     target = lambda_returns(
-        jnp.where(ends, value[:-1], shared_reward(rows.reward[1:], config)),
-        config.gamma * (1.0 - (rows.terminated[1:] | ends)),
+        jnp.where(ends, value[:-1], shared_reward(rows.reward[1:], team_reward)),
+        gamma * (1.0 - (rows.terminated[1:] | ends)),
         value[1:],
-        config.gae_lambda,
+        gae_lambda,
     )
-    seen = jax.tree.map(lambda x: x[:-1], view)
-    return ValueRows(seen, target, jnp.broadcast_to(1.0 - ends, target.shape))
+    return target, jnp.broadcast_to(1.0 - ends, target.shape)
 
 
 def actor_loss(
@@ -289,9 +301,7 @@ def update(
     The critic learns from `replayed` rows too, all of them in every minibatch, if there are any.
     """
     rows, metrics = experience(state.critic, trajectory, config)
-    n_rows = rows.target.shape[0]
-    batch_size = min(config.batch_size, n_rows)
-    n_batches = n_rows // batch_size
+    batches = minibatches(key, rows.target.shape[0], config.batch_size, config.n_epochs)
     actor_optimiser, critic_optimiser = optimisers(config)
 
     def critic_objective(critic: Critic, batch: PPORows) -> tuple[Float[Array, ""], Metrics]:
@@ -320,11 +330,5 @@ def update(
         )
         return state, actor_metrics | critic_metrics
 
-    def shuffled(key: PRNGKey) -> Array:
-        order = jax.random.permutation(key, n_rows)[: n_batches * batch_size]
-        return rearrange(order, "(m b) -> m b", m=n_batches)
-
-    batches = jax.vmap(shuffled)(jax.random.split(key, config.n_epochs))
-    batches = rearrange(batches, "e m b -> (e m) b")
     state, history = jax.lax.scan(minibatch, state, batches)
     return state, metrics | jax.tree.map(jnp.mean, history) | {"behaviour/ent_coef": state.ent_coef}

@@ -11,6 +11,7 @@ from einops import rearrange
 from jaxtyping import Array, Bool, Float, Int
 
 from mabl.behaviour.actor import MaskedCategorical
+from mabl.behaviour.base import minibatches
 from mabl.errors import require_between, require_positive
 from mabl.losses.returns import lambda_returns
 from mabl.nets.mlp import MLP
@@ -187,9 +188,7 @@ class QMIX(NamedTuple):
         del replayed
         config = self.config
         rows, metrics = experience(state, trajectory, config)
-        n_rows = rows.target.shape[0]
-        batch_size = min(config.batch_size, n_rows)
-        n_batches = n_rows // batch_size
+        batches = minibatches(key, rows.target.shape[0], config.batch_size, config.n_epochs)
 
         def minibatch(state: QState, index: Array) -> tuple[QState, Metrics]:
             batch = jax.tree.map(lambda x: x[index], rows)
@@ -201,12 +200,7 @@ class QMIX(NamedTuple):
             )
             return QState(values, target, opt, state.epsilon), metrics
 
-        def shuffled(key: PRNGKey) -> Array:
-            order = jax.random.permutation(key, n_rows)[: n_batches * batch_size]
-            return rearrange(order, "(m b) -> m b", m=n_batches)
-
-        batches = jax.vmap(shuffled)(jax.random.split(key, config.n_epochs))
-        state, history = jax.lax.scan(minibatch, state, rearrange(batches, "e m b -> (e m) b"))
+        state, history = jax.lax.scan(minibatch, state, batches)
         fall = (config.epsilon_start - config.epsilon_end) / config.epsilon_updates
         epsilon = jnp.maximum(state.epsilon - fall, config.epsilon_end)
         metrics |= jax.tree.map(jnp.mean, history) | {"behaviour/epsilon": epsilon}
