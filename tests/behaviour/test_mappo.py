@@ -226,9 +226,9 @@ def test_replayed_values_are_told_who_is_alive_in_each_row():
 
 def test_normalised_advantages_by_hand():
     rows, _ = experience(replace(BY_HAND, normalise_advantage=True), two_steps())
-    # Weighted mean (0.53125 + 0.5 * 0.25) / 1.5 = 0.4375, deviations 0.09375 and -0.1875,
-    # variance (0.09375^2 + 0.5 * 0.1875^2) / 1.5 = 0.0175781, root 0.132583
-    assert_allclose(rows.advantage, [[0.70711] * 2, [-1.41421] * 2], rtol=2e-4)
+    # Of the living: mean (2 * 0.53125 + 0.5 * 0.25) / 2.5 = 0.475, deviations 0.05625 and -0.225,
+    # variance (2 * 0.05625^2 + 0.5 * 0.225^2) / 2.5 = 0.0126563, root 0.1125
+    assert_allclose(rows.advantage, [[0.5] * 2, [-2.0] * 2], rtol=2e-4)
 
 
 def random_trajectory(h: int, b: int, reward: Array | None = None) -> Trajectory:

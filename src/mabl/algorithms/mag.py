@@ -131,7 +131,7 @@ def best_candidate(
     """Of `candidates` draws of the next state, the one with the smallest predicted errors ahead.
 
     From each draw the policy goes on for `steps` steps; the errors predicted there are summed over
-    steps and agents. Every start state chooses for itself (ADR 9).
+    steps and agents. Every start state chooses for itself (ADR 10).
     """
     key_draw, key_future = jax.random.split(key)
 

@@ -15,7 +15,7 @@ from mabl.algorithms.config import Config
 from mabl.behaviour.actor import Actor
 from mabl.behaviour.base import minibatches
 from mabl.behaviour.critic import Critic
-from mabl.behaviour.mappo import PPORows, real_returns
+from mabl.behaviour.mappo import PPORows, real_returns, weighted_mean
 from mabl.behaviour.recurrent import (
     Chunks,
     RecurrentFilter,
@@ -45,7 +45,8 @@ class PolicyLearner(NamedTuple):
 class ModelFree:
     """Recurrent MAPPO on real episodes; each update sees the rows of one cycle only.
 
-    Raises UserError for rows of a cycle that do not divide into chunks.
+    Raises UserError for rows of a cycle that do not divide into chunks, and for a schedule that
+    would have it learn from rows of an earlier policy.
     """
 
     spec: EnvSpec
@@ -57,6 +58,18 @@ class ModelFree:
             raise UserError(
                 f"--training.collect-steps is {rows}: give a multiple of the {length} rows of "
                 "--recurrent-mappo.chunk-length"
+            )
+        plan = self.config.training
+        for field in ("model_updates", "pretrain_updates", "prefill_steps"):
+            if getattr(plan, field):
+                raise UserError(
+                    f"--training.{field.replace('_', '-')} is {getattr(plan, field)}: "
+                    f"{self.config.algo} has no model and learns from all it does: give 0"
+                )
+        if plan.policy_updates != 1:
+            raise UserError(
+                f"--training.policy-updates is {plan.policy_updates}: {self.config.algo} learns "
+                "once from what it has just done: give 1, and --recurrent-mappo.n-epochs"
             )
 
     @property
@@ -112,7 +125,7 @@ class ModelFree:
             returns=learner.returns.update(targets, weights, config.value_decay)
         )
         n_chunks = chunks.memory.shape[0]
-        size = max(n_chunks // config.n_minibatches, 1)
+        size = -(-n_chunks // config.n_minibatches)
         batches = minibatches(key, n_chunks, size, config.n_epochs)
         optimiser = self._optimiser()
 
@@ -160,8 +173,8 @@ class ModelFree:
         )(value, rows)
         advantage = target - value[:, :-1]
         counted = weight * rows.alive[:, :-1]
-        mean = (counted * advantage).sum() / counted.sum()
-        std = jnp.sqrt((counted * (advantage - mean) ** 2).sum() / counted.sum())
+        mean = weighted_mean(advantage, counted)
+        std = jnp.sqrt(weighted_mean((advantage - mean) ** 2, counted))
         view = jax.tree.map(lambda x: x[:, :-1], view)
         policy = policies(learner.policy.filter, learner.policy.actor, view)
         action = rows.prev_action[:, 1:]
@@ -180,8 +193,8 @@ class ModelFree:
             rows=jax.tree.map(cut, ppo),
         )
         metrics = {
-            "behaviour/value": (weight * value[:, :-1]).sum() / weight.sum(),
-            "behaviour/return": (weight * target).sum() / weight.sum(),
+            "behaviour/value": weighted_mean(value[:, :-1], weight),
+            "behaviour/return": weighted_mean(target, weight),
             "behaviour/advantage_std": std,
         }
         return chunks, metrics

@@ -101,7 +101,7 @@ QUICK = {
 
 PRESETS = {"quick": QUICK, "paper": PAPER}
 
-# MAMBA's own rates; all else is as matched as its sizes.
+# MAMBA's own rates on every map; all else is as matched as its sizes.
 _MAMBA_PAPER = {
     "world_model": {"learning_rate": 2e-4},
     "mappo": {"actor_learning_rate": 5e-4, "critic_learning_rate": 5e-4},
@@ -123,6 +123,8 @@ _RECIPE = _ON_POLICY | {"num_envs": 8, "collect_steps": 400, "replay_capacity": 
 BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
     ("paper", "smax", "mamba"): _MAMBA_PAPER,
     ("paper", "smax", "mag"): _MAMBA_PAPER,
+    ("paper", "test", "mamba"): _MAMBA_PAPER,
+    ("paper", "test", "mag"): _MAMBA_PAPER,
     ("paper", "smax", "mappo"): {"training": _RECIPE},
     ("paper", "test", "mappo"): {"training": _RECIPE},
     ("quick", "smax", "mag"): {"lookahead": {"steps": 3, "hidden": 128, "n_hidden": 2}},
@@ -175,11 +177,11 @@ def preset(name: str, env: str, algo: str) -> Config:
     if family not in families:
         raise registry.unknown(env)
     config = replace(families[family], env=env, algo=algo)
+    if name == "paper" and env in PAPER_MODEL_LEARNING_RATE:
+        rate = PAPER_MODEL_LEARNING_RATE[env]
+        config = replace(config, world_model=replace(config.world_model, learning_rate=rate))
     changes = BY_ALGORITHM.get((name, family, algo), {})
     for field, new in changes.items():
         value = replace(getattr(config, field), **new) if isinstance(new, dict) else new
         config = replace(config, **{field: value})
-    if name == "paper" and env in PAPER_MODEL_LEARNING_RATE:
-        rate = PAPER_MODEL_LEARNING_RATE[env]
-        config = replace(config, world_model=replace(config.world_model, learning_rate=rate))
     return config

@@ -63,7 +63,7 @@ class MAPPOConfig:
     """Weight of the critic's error on replayed sequences beside that on imagined ones (ADR 8); 0 in
     the paper."""
     normalise_advantage: bool = True
-    """Give advantages zero mean and unit variance over the imagined rows."""
+    """Give advantages zero mean and unit variance over the imagined rows of the living."""
     team_reward: bool = True
     """Average predicted rewards over agents (SMAC, MAMuJoCo)."""
 
@@ -190,16 +190,13 @@ def experience(
         reward, config.gamma * trajectory.continues, value[1:], config.gae_lambda
     )
     advantage = target - value[:-1]
-
-    def mean(x: Array, weight: Array = weight) -> Array:
-        return (weight * x).sum() / (weight.sum() + 1e-8)
-
-    centred = advantage - mean(advantage)
-    std = jnp.sqrt(mean(centred**2))
+    counted = weight * view.alive[:-1]
+    centred = advantage - weighted_mean(advantage, counted)
+    std = jnp.sqrt(weighted_mean(centred**2, counted))
     metrics = {
-        "behaviour/imagined_reward": mean(reward),
-        "behaviour/imagined_return": mean(target[0], weight[0]),
-        "behaviour/value": mean(value[:-1]),
+        "behaviour/imagined_reward": weighted_mean(reward, weight),
+        "behaviour/imagined_return": weighted_mean(target[0], weight[0]),
+        "behaviour/value": weighted_mean(value[:-1], weight),
         "behaviour/advantage_std": std,
     }
     rows = PPORows(
@@ -250,6 +247,11 @@ def real_returns(
     return target, jnp.broadcast_to(1.0 - ends, target.shape)
 
 
+def weighted_mean(values: Float[Array, "*b"], weight: Float[Array, "*b"]) -> Float[Array, ""]:
+    """Mean of what counts; 0 where nothing does."""
+    return (weight * values).sum() / (weight.sum() + 1e-8)
+
+
 def actor_loss(
     actor: Actor, rows: PPORows, ent_coef: Float[Array, ""], clip: float
 ) -> tuple[Float[Array, ""], Metrics]:
@@ -263,20 +265,20 @@ def policy_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """PPO's clipped surrogate minus the entropy bonus.
 
-    Rows without a choice, such as those of the dead, do not count.
+    Rows of the dead, and rows without a choice, do not count.
     """
-    weight = rows.weight * (rows.view.available.sum(-1) != 1)
-    log_prob = policy.log_prob(rows.action)
+    weight = rows.weight * rows.view.alive * (rows.view.available.sum(-1) != 1)
+    # What does not count may be no choice at all, whose ratio must not overflow.
+    log_prob = jnp.where(weight > 0, policy.log_prob(rows.action), rows.log_prob)
     surrogate = clipped_surrogate(log_prob, rows.log_prob, rows.advantage, clip)
-    total = weight.sum() + 1e-8
-    entropy = (weight * policy.entropy()).sum() / total
-    loss = (weight * surrogate).sum() / total - ent_coef * entropy
+    entropy = weighted_mean(policy.entropy(), weight)
+    loss = weighted_mean(surrogate, weight) - ent_coef * entropy
     ratio = jnp.exp(log_prob - rows.log_prob)
     return loss, {
         "behaviour/actor_loss": loss,
         "behaviour/entropy": entropy,
-        "behaviour/clip_fraction": (weight * (jnp.abs(ratio - 1) > clip)).sum() / total,
-        "behaviour/approx_kl": (weight * (rows.log_prob - log_prob)).sum() / total,
+        "behaviour/clip_fraction": weighted_mean(1.0 * (jnp.abs(ratio - 1) > clip), weight),
+        "behaviour/approx_kl": weighted_mean(rows.log_prob - log_prob, weight),
     }
 
 
@@ -285,7 +287,7 @@ def critic_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """`value_coef` times the squared error to the lambda-returns."""
     error = jax.vmap(critic)(rows.view.critic_features, rows.view.alive) - rows.target
-    loss = value_coef * (rows.weight * error**2).sum() / (rows.weight.sum() + 1e-8)
+    loss = value_coef * weighted_mean(error**2, rows.weight)
     return loss, {"behaviour/critic_loss": loss}
 
 

@@ -238,7 +238,6 @@ def experience(state: QState, trajectory: Trajectory, config: QMIXConfig) -> tup
     metrics = {
         "behaviour/imagined_reward": (weight * reward).sum() / total,
         "behaviour/imagined_return": (weight[0] * target[0]).sum() / (weight[0].sum() + 1e-8),
-        "behaviour/value": (weight * target).sum() / total,
     }
     return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.behaviour.actor import MaskedCategorical
 from mabl.behaviour.base import ActorFunction
-from mabl.behaviour.mappo import PPORows, ValueFunction, policy_loss
+from mabl.behaviour.mappo import PPORows, ValueFunction, policy_loss, weighted_mean
 from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.mlp import Linear
 from mabl.nets.normaliser import Normaliser
@@ -47,7 +47,7 @@ class RecurrentMAPPOConfig:
     n_epochs: int = 5
     """Passes over the rows of a cycle."""
     n_minibatches: int = 1
-    """Minibatches of a pass."""
+    """Minibatches of a pass, at most."""
     chunk_length: int = 10
     """Rows through which gradients flow back in time; a divisor of --training.collect-steps."""
     ent_coef: float = 0.01
@@ -167,5 +167,5 @@ def value_loss(
     """`value_coef` times the Huber loss to the normalised returns; the critic speaks normalised."""
     value = jax.vmap(jax.vmap(critic))(rows.view.critic_features, rows.view.alive)
     loss = optax.huber_loss(value, returns.normalise(rows.target), delta=HUBER_DELTA)
-    loss = value_coef * (rows.weight * loss).sum() / rows.weight.sum()
+    loss = value_coef * weighted_mean(loss, rows.weight)
     return loss, {"behaviour/critic_loss": loss}

@@ -22,13 +22,17 @@ class Normaliser(NamedTuple):
     def update(
         self, values: Float[Array, "*b"], weights: Float[Array, "*b"], decay: float
     ) -> "Normaliser":
-        """After a batch of values that count as their weights say; `decay` of what was remains."""
+        """After a batch of values that count as their weights say; `decay` of what was remains.
+
+        A batch in which nothing counts changes nothing.
+        """
+        decayed = jnp.where(weights.sum() > 0, decay, 1.0)
         total = weights.sum() + 1e-8
         mean = (weights * values).sum() / total
         mean_square = (weights * values**2).sum() / total
         old = (self.mean, self.mean_square, self.weight)
         new = (mean, mean_square, jnp.float32(1))
-        return Normaliser(*(decay * a + (1 - decay) * b for a, b in zip(old, new, strict=True)))
+        return Normaliser(*(decayed * a + (1 - decayed) * b for a, b in zip(old, new, strict=True)))
 
     def moments(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Mean and standard deviation (0.1 at least; 0 and 1 before any value)."""
