@@ -13,7 +13,7 @@ layers:
 	uv run lint-imports
 
 test:
-	uv run pytest
+	uv run pytest -n auto
 
 # The versions to paste into [tool.uv] constraint-dependencies, after removing the old ones there.
 pins:

@@ -241,7 +241,8 @@ def test_ctrl_c_saves_and_the_run_can_be_resumed(mabl, tmp_path):
     logdir = tmp_path / "runs"
 
     def interrupt():
-        while not any(logdir.glob("test/coordination/mabl/seed_0/*/metrics.jsonl")):
+        pattern = "test/coordination/mabl/seed_0/*/metrics.jsonl"
+        while not any(path.stat().st_size for path in logdir.glob(pattern)):
             time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 
