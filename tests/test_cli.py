@@ -105,6 +105,14 @@ MISTAKES = {
         ],
         "--world-model.overshooting decodes what imagination would draw",
     ),
+    "off-policy": (
+        ["train", "--algo=mappo", "--training.policy-updates=3"],
+        "--training.policy-updates is 3: mappo learns once from what it has just done",
+    ),
+    "no model": (
+        ["train", "--algo=mappo", "--training.pretrain-updates=5"],
+        "--training.pretrain-updates is 5: mappo has no model and learns from all it does: give 0",
+    ),
     "no folder": (["eval", "nowhere"], "nowhere is not a run folder"),
     "resume nothing": (["resume", "nowhere"], "nowhere is not a run folder"),
     "nothing to do": (["eval"], "give either a run folder or --policy random|heuristic"),

@@ -284,6 +284,25 @@ def test_losses_count_rows_by_their_weight(fresh):
     assert_allclose(loss, -ratio * float(rows.advantage[5, 1]), rtol=1e-5)
 
 
+def test_the_dead_never_count_in_the_policy_loss(fresh):
+    rows, _ = experience(BY_HAND, random_trajectory(3, 4))
+    alive = jnp.ones_like(rows.view.alive).at[::2, 1].set(False)
+    rows = rows._replace(view=rows.view._replace(alive=alive))
+
+    def loss(reward_of_the_dead: float) -> float:
+        advantage = jnp.where(alive, rows.advantage, reward_of_the_dead)
+        return float(
+            mappo.actor_loss(
+                fresh.actor, rows._replace(advantage=advantage), jnp.float32(0.1), 0.2
+            )[0]
+        )
+
+    assert loss(0.0) == loss(1e3)
+    everyone = rows._replace(view=rows.view._replace(alive=jnp.ones_like(alive)))
+    other, _ = mappo.actor_loss(fresh.actor, everyone, jnp.float32(0.1), 0.2)
+    assert float(other) != loss(0.0)
+
+
 # --- updates ----------------------------------------------------------------------------------
 
 
