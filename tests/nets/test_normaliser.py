@@ -85,3 +85,8 @@ def test_it_passes_through_jit_and_scan():
 
     scanned, _ = jax.jit(lambda: jax.lax.scan(step, Normaliser.fresh(), values))()
     assert_allclose(scanned, after([1.0, 3.0], [6.0]), rtol=1e-5)
+
+
+def test_a_batch_without_weight_changes_nothing():
+    for normaliser in (Normaliser.fresh(), after([1.0, 3.0])):
+        assert_array_equal(normaliser.update(jnp.array([9.0]), jnp.zeros(1), 0.9), normaliser)
