@@ -105,6 +105,10 @@ MISTAKES = {
         ],
         "--world-model.overshooting decodes what imagination would draw",
     ),
+    "epsilon": (
+        ["train", "--algo=mabl-qmix", "--qmix.epsilon-start=0.1", "--qmix.epsilon-end=0.2"],
+        "--qmix.epsilon-end is 0.2: give a number from 0 to 0.1",
+    ),
     "off-policy": (
         ["train", "--algo=mappo", "--training.policy-updates=3"],
         "--training.policy-updates is 3: mappo learns once from what it has just done",

@@ -32,9 +32,9 @@ class Entry:
     sections: tuple[str, ...] = IN_IMAGINATION
     """Sections of `Config` that it reads."""
     sees_team: bool = True
-    """Training learns from the observations of all agents for each of them."""
+    """Each agent's model, or without one its critic's input, knows all observations in training."""
     sees_state: bool = True
-    """Training learns from other global information."""
+    """It knows other global information: the state."""
     decentralised: bool = True
     """An agent acts on its own observations alone."""
     shared: bool = True
@@ -49,8 +49,8 @@ class Column(NamedTuple):
 
 
 COLUMNS = (
-    Column("sees_team", "learns from all observations"),
-    Column("sees_state", "from the state"),
+    Column("sees_team", "knows all observations"),
+    Column("sees_state", "knows the state"),
     Column("decentralised", "acts decentralised"),
     Column("shared", "shares parameters"),
 )

@@ -58,7 +58,8 @@ class QMIXConfig:
         require_positive(self, "learning_rate", "grad_clip", "n_epochs", "batch_size")
         require_positive(self, "epsilon_updates")
         require_between(self, 0, 1, "gamma", "td_lambda", "target_rate")
-        require_between(self, 0, 1, "epsilon_start", "epsilon_end")
+        require_between(self, 0, 1, "epsilon_start")
+        require_between(self, 0, self.epsilon_start, "epsilon_end")
 
 
 class EpsilonGreedy(eqx.Module):
