@@ -238,17 +238,6 @@ def test_a_run_folder_holds_what_the_documentation_says(trained):
     assert any("world_model/open_loop_obs_15" in row for row in rows_of(trained))
 
 
-def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(trained, mabl, tmp_path):
-    resumed = tmp_path / "run"
-    shutil.copytree(trained, resumed)
-    with (resumed / "metrics.jsonl").open("a") as file:
-        file.write('{"step": 9999, "train/score": 1.0}\n{"step": 10')  # past the checkpoint; torn
-    assert mabl("resume", resumed, "--total-steps=1200")[0] == 0
-    assert mabl("train", *TINY, "--total-steps=1200", f"--logdir={tmp_path / 'whole'}")[0] == 0
-    (whole,) = (tmp_path / "whole").glob("test/coordination/mabl/seed_0/*")
-    assert rows_of(resumed) == rows_of(whole)
-
-
 def test_ctrl_c_saves_and_the_run_can_be_resumed(mabl, tmp_path):
     logdir = tmp_path / "runs"
 

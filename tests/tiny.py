@@ -46,9 +46,9 @@ def tiny(algo: str, env: str = "test/coordination") -> Config:
     )
 
 
-def flags(algo: str) -> list[str]:
+def flags(algo: str, env: str) -> list[str]:
     """The same as flags of `mabl train`."""
-    config, given = tiny(algo), [f"--algo={algo}", "--env=test/coordination"]
+    config, given = tiny(algo, env), [f"--algo={algo}", f"--env={env}"]
     for name in entry(algo).sections:
         section = getattr(config, name)
         changed = SIZES[name] | (LEARNING_STARTS if name == "training" else {})

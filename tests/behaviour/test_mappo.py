@@ -101,7 +101,7 @@ def reset_row():
 class ConstantCritic(NamedTuple):
     value: float
 
-    def __call__(self, features: Array, alive: Array) -> Array:
+    def __call__(self, features: Array) -> Array:
         return jnp.full(features.shape[0], self.value)
 
 
@@ -155,28 +155,10 @@ def test_without_team_reward_every_agent_keeps_its_own():
     assert_allclose(rows.target, [[1.53125, 3.53125], [2.25, 2.25]])
 
 
-class HeadCount:
-    """The value of a team is how many of it are alive."""
-
-    def __call__(self, features: Array, alive: Array) -> Array:
-        return jnp.full(features.shape[0], alive.sum(dtype=jnp.float32))
-
-
-def test_the_critic_is_told_who_is_alive_in_each_row():
-    rows, metrics = mappo.experience(HeadCount(), two_steps(), BY_HAND)
-    # Values 2, 1 and 0. G_1 = 2 + 0.125 * 0 = 2, G_0 = 2 + 0.25 (0.5 * 1 + 0.5 * 2) = 2.375
-    assert_allclose(rows.target, [[2.375] * 2, [2.0] * 2])
-    assert_allclose(rows.advantage, [[0.375] * 2, [1.0] * 2])
-    assert_allclose(metrics["behaviour/value"], (2 * 1 + 1 * 0.5) / 1.5)
-    # Squared errors 0.375^2 and 1, weights 1 and 0.5: (0.140625 + 0.5) / 1.5 = 0.427083, half of it
-    loss, _ = mappo.critic_loss(HeadCount(), rows, 0.5)
-    assert_allclose(loss, 0.5 * 0.427083, rtol=1e-5)
-
-
 class RowCritic:
     """Values that tell which row they are of: 1, 2, 4, 8."""
 
-    def __call__(self, features: Array, alive: Array) -> Array:
+    def __call__(self, features: Array) -> Array:
         return 2.0 ** features[:, 0]
 
 
@@ -212,16 +194,6 @@ def test_replayed_values_by_hand(end, targets):
     assert_array_equal(real.view.alive, [[True, True], [True, True], [True, False]])
     alone = mappo.replayed_values(RowCritic(), replayed, replace(BY_HAND, team_reward=False))
     assert_allclose(alone.target[0], [targets[0] - 1, targets[0] + 1])
-
-
-def test_replayed_values_are_told_who_is_alive_in_each_row():
-    rows = jax.tree.map(lambda x: jnp.zeros((3, *x.shape), x.dtype), reset_row())
-    rows = rows._replace(reward=jnp.full((3, 2), 2.0))
-    alive = jnp.array([[True, True], [True, False], [False, False]])
-    replayed = Replayed(some_view(3, 2)._replace(alive=alive), rows)
-    # Values 2, 1 and 0; G_1 = 2 + 0.5 * 0 = 2, G_0 = 2 + 0.5 (0.5 * 1 + 0.5 * 2) = 2.75
-    real = mappo.replayed_values(HeadCount(), replayed, BY_HAND)
-    assert_allclose(real.target, [[2.75] * 2, [2.0] * 2])
 
 
 def test_normalised_advantages_by_hand():
@@ -275,7 +247,7 @@ def test_a_start_of_weight_zero_never_counts():
 def test_losses_count_rows_by_their_weight(fresh):
     rows, _ = experience(BY_HAND, random_trajectory(3, 4))
     rows = rows._replace(weight=jnp.zeros_like(rows.weight).at[5, 1].set(0.3))
-    value = float(fresh.critic(rows.view.critic_features[5], rows.view.alive[5])[1])
+    value = float(fresh.critic(rows.view.critic_features[5])[1])
     loss, _ = mappo.critic_loss(fresh.critic, rows, 0.5)
     assert_allclose(loss, 0.5 * (value - float(rows.target[5, 1])) ** 2, rtol=1e-5)
     policy = jax.vmap(fresh.actor)(rows.view.actor_features[5], rows.view.available[5])
@@ -317,7 +289,7 @@ def test_zero_advantages_leave_the_actor_alone_while_the_critic_learns(fresh):
     after, _ = mappo.update(before, trajectory, jax.random.key(0), config)
     assert same(after.actor, before.actor)
     assert not same(after.critic, before.critic)
-    value = jax.vmap(after.critic)(trajectory.view.critic_features[0], trajectory.view.alive[0])
+    value = jax.vmap(after.critic)(trajectory.view.critic_features[0])
     assert (value > 0).all()  # on its way from 0 to 1
 
 
@@ -368,7 +340,7 @@ def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fres
     real = mappo.ValueRows(view, jnp.full((6, 2), 9.0), jnp.ones((6, 2)))
 
     def value(state):
-        return state.critic(view.critic_features[0], view.alive[0])
+        return state.critic(view.critic_features[0])
 
     def updated(coef, replayed):
         config = replace(TINY, replay_value_coef=coef)
@@ -414,7 +386,7 @@ def test_the_behaviour_offers_its_actor_its_value_and_all_that_a_model_has_for_c
     assert behaviour.actor(fresh) is fresh.actor
     for alive in ([True, True], [True, False]):
         value = behaviour.value(fresh, view._replace(alive=jnp.array(alive)))
-        assert_array_equal(value, fresh.critic(view.critic_features, jnp.array(alive)))
+        assert_array_equal(value, fresh.critic(view.critic_features))
 
     class Doubling:
         def critic_features(self, latent):
@@ -424,14 +396,13 @@ def test_the_behaviour_offers_its_actor_its_value_and_all_that_a_model_has_for_c
     assert_array_equal(features, 2 * view.critic_features)
 
 
-def test_the_critic_hears_the_living_alone(fresh):
+def test_the_critic_hears_everybody_or_those_that_it_is_to_hear(fresh):
     features = some_view(3).critic_features
     moved = features.at[1].add(9.0)
-    dead, living = jnp.array([True, False, True]), jnp.ones(3, bool)
-    others = np.array([0, 2])
-    assert_array_equal(fresh.critic(features, dead)[others], fresh.critic(moved, dead)[others])
-    assert fresh.critic(features, dead)[1] != fresh.critic(moved, dead)[1]
-    assert (fresh.critic(features, living) != fresh.critic(moved, living)).all()
+    heard, others = jnp.array([True, False, True]), np.array([0, 2])
+    assert_array_equal(fresh.critic(features, heard)[others], fresh.critic(moved, heard)[others])
+    assert fresh.critic(features, heard)[1] != fresh.critic(moved, heard)[1]
+    assert (fresh.critic(features) != fresh.critic(moved)).all()
 
 
 # --- with a real world model ------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mabl.nets.attention import SelfAttention
@@ -12,7 +13,7 @@ from mabl.types import PRNGKey
 class Critic(eqx.Module):
     """V of each agent given its features, e.g. (z_agent, z_global, h_agent, h_global).
 
-    It attends to the features of all agents that are alive.
+    It attends to the features of everybody, or of those alone that it is to hear.
     """
 
     embed: Linear
@@ -26,9 +27,10 @@ class Critic(eqx.Module):
         self.mlp = MLP(hidden, 1, hidden, n_hidden, key_mlp)
 
     def __call__(
-        self, features: Float[Array, "N G"], alive: Bool[Array, " N"]
+        self, features: Float[Array, "N G"], heard: Bool[Array, " N"] | None = None
     ) -> Float[Array, " N"]:
         """One value for each agent of a team."""
+        heard = jnp.ones(features.shape[0], bool) if heard is None else heard
         x = jax.nn.relu(jax.vmap(self.embed)(features))
-        x = x + self.attention(x, alive)
+        x = x + self.attention(x, heard)
         return jax.vmap(self.mlp)(x)[:, 0]

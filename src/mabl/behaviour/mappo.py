@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from einops import rearrange
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mabl.behaviour.actor import Actor, MaskedCategorical
 from mabl.behaviour.base import minibatches
@@ -79,8 +79,11 @@ class MAPPOConfig:
             )
 
 
-ValueFunction = Callable[[Float[Array, "N G"], Bool[Array, " N"]], Float[Array, " N"]]
-"""What a critic is to the losses: features of a team and who is alive to a value for each agent."""
+ValueFunction = Callable[[Float[Array, "N G"]], Float[Array, " N"]]
+"""What a critic is to the losses: features of a team to a value for each agent.
+
+The dead are heard too: their latents are no padding, and know of the team (ADR 9).
+"""
 
 
 class ActorCritic(NamedTuple):
@@ -145,7 +148,7 @@ class MAPPO(NamedTuple):
 
     def value(self, state: ActorCritic, view: TeamView) -> Float[Array, " N"]:
         """The critic's."""
-        return state.critic(view.critic_features, view.alive)
+        return state.critic(view.critic_features)
 
     def update(
         self, state: ActorCritic, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
@@ -185,7 +188,7 @@ def experience(
     """Lambda-returns and advantages of trajectories, flattened to joint rows."""
     weight, reward = trajectory.weight, shared_reward(trajectory.reward, config.team_reward)
     view = trajectory.view
-    value = jax.vmap(jax.vmap(critic))(view.critic_features, view.alive)
+    value = jax.vmap(jax.vmap(critic))(view.critic_features)
     target = lambda_returns(
         reward, config.gamma * trajectory.continues, value[1:], config.gae_lambda
     )
@@ -220,7 +223,7 @@ def shared_reward(reward: Float[Array, "*b N"], team_reward: bool) -> Float[Arra
 def replayed_values(critic: ValueFunction, replayed: Replayed, config: MAPPOConfig) -> ValueRows:
     """Lambda-returns along one real sequence `[T, ...]`, whoever acted in it (ADR 8)."""
     view, rows = replayed
-    value = jax.vmap(critic)(view.critic_features, view.alive)
+    value = jax.vmap(critic)(view.critic_features)
     target, weight = real_returns(value, rows, config.gamma, config.gae_lambda, config.team_reward)
     return ValueRows(jax.tree.map(lambda x: x[:-1], view), target, weight)
 
@@ -286,7 +289,7 @@ def critic_loss(
     critic: ValueFunction, rows: PPORows | ValueRows, value_coef: float
 ) -> tuple[Float[Array, ""], Metrics]:
     """`value_coef` times the squared error to the lambda-returns."""
-    error = jax.vmap(critic)(rows.view.critic_features, rows.view.alive) - rows.target
+    error = jax.vmap(critic)(rows.view.critic_features) - rows.target
     loss = value_coef * weighted_mean(error**2, rows.weight)
     return loss, {"behaviour/critic_loss": loss}
 

@@ -1,5 +1,6 @@
 """What a model-free agent remembers: an encoder and a GRU that learn through PPO alone [46]."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, NamedTuple
@@ -12,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.behaviour.actor import MaskedCategorical
 from mabl.behaviour.base import ActorFunction
-from mabl.behaviour.mappo import PPORows, ValueFunction, policy_loss, weighted_mean
+from mabl.behaviour.mappo import PPORows, policy_loss, weighted_mean
 from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.mlp import Linear
 from mabl.nets.normaliser import Normaliser
@@ -20,6 +21,10 @@ from mabl.types import Metrics, PRNGKey, TeamView
 
 HUBER_DELTA = 10.0
 """Beyond it the critic's loss is linear; in standard deviations of the returns."""
+
+ValueFunction = Callable[[Float[Array, "N G"], Bool[Array, " N"]], Float[Array, " N"]]
+"""What a critic is to the loss: observations of a team, and who is alive to be heard, to a value
+for each agent. The dead see nothing that others do not."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ class CountingEnv:
 
     obs[i] = (t, i, last action of i, episode), state = (t, episode), reward[i] = 100 t + action i;
     action (t mod n) is unavailable at row t. Episodes with an even number terminate at row 5, odd
-    ones are truncated at row 7.
+    ones are truncated at row 7. Agent 1 is dead from row 4 on.
     """
 
     spec = EnvSpec(
@@ -64,7 +64,7 @@ class CountingEnv:
             obs=jnp.stack(columns, axis=-1).astype(jnp.float32),
             state=jnp.stack([t, episode]).astype(jnp.float32),
             available=jnp.broadcast_to(jnp.arange(3) != t % 3, (2, 3)),
-            alive=jnp.ones(2, bool),
+            alive=(agents == 0) | (t < 4),
             is_first=first,
             score=jnp.where(terminated | truncated, episode.astype(jnp.float32), jnp.nan),
         )

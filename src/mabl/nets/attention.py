@@ -1,4 +1,4 @@
-"""Attention over agents [39]: those that are dead or absent are left out."""
+"""Attention over agents [39] that leaves out those that are dead or absent."""
 
 import equinox as eqx
 import jax
