@@ -59,7 +59,7 @@ class TeamView(NamedTuple):
     available: Bool[Array, "*b N A"]
     """Actions that may be taken."""
     alive: Bool[Array, "*b N"]
-    """Attention over agents leaves out those that are not."""
+    """Policy losses leave out those that are not (ADR 9)."""
 
 
 class Trajectory(NamedTuple):
