@@ -30,7 +30,7 @@ from mabl.algorithms.registry import ALGORITHMS
 from mabl.runs.checkpoint import named
 from mabl.runs.folder import read_config
 from mabl.runs.metrics import read
-from mabl.training.run import build
+from mabl.training.programs import build
 
 WINDOW = 4_000
 """Environment steps over which training episodes are averaged in curves."""

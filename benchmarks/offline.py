@@ -27,7 +27,7 @@ from mabl.execution import executor_of
 from mabl.replay import Replay
 from mabl.runs import folder
 from mabl.runs.checkpoint import Checkpoints
-from mabl.training.run import build
+from mabl.training.programs import build
 from mabl.types import PRNGKey
 
 CHUNK = 50

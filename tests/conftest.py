@@ -1,4 +1,7 @@
-"""Shared settings: mabl's warnings are errors, rank promotion raises, programs are cached."""
+"""Shared settings: mabl's warnings are errors, rank promotion raises, programs are cached.
+
+They are compiled quickly instead of well: most tests compute next to nothing.
+"""
 
 import os
 from pathlib import Path
@@ -12,6 +15,7 @@ import jax
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_disable_most_optimizations", True)
 
 
 def pytest_configure(config):

@@ -7,7 +7,7 @@ import jax
 from tests.tiny import tiny
 
 from mabl.algorithms.registry import ALGORITHMS
-from mabl.training.run import build
+from mabl.training.programs import build
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -43,7 +43,7 @@ class Rollout(NamedTuple):
 
 def start(env: CompiledEnv, executor: Executor, key: PRNGKey) -> Collector:
     """A collector whose next row is a reset."""
-    env_state, row = env.reset(key)
+    env_state, row = jax.tree.map(strong, env.reset(key))
     return Collector(
         env_state=env_state,
         row=row._replace(truncated=jnp.bool_(True)),
@@ -51,6 +51,11 @@ def start(env: CompiledEnv, executor: Executor, key: PRNGKey) -> Collector:
         episode_return=jnp.float32(0),
         episode_length=jnp.int32(0),
     )
+
+
+def strong(x: Array) -> Array:
+    """Without JAX's weak type, which no checkpoint keeps: a resumed run would be traced anew."""
+    return x if jnp.issubdtype(x.dtype, jax.dtypes.extended) else x.astype(x.dtype)
 
 
 def advance(

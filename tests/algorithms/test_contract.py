@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -12,7 +13,8 @@ from tests.tiny import flags, tiny
 from mabl import Policy, TeamPolicy, UserError, cli, preset
 from mabl.algorithms.registry import ALGORITHMS
 from mabl.runs.checkpoint import Checkpoints, named
-from mabl.training.run import build
+from mabl.runs.folder import read_config
+from mabl.training.programs import build, programs
 
 ENV = "test/counting"
 """Its episodes end and are cut short, actions are unavailable, and an agent dies."""
@@ -25,25 +27,31 @@ EVERY = pytest.mark.parametrize(
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _compile_quickly():
-    """What little is computed here need not be fast."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+@pytest.fixture(scope="module")
+def logdir(tmp_path_factory):
+    return tmp_path_factory.mktemp("runs")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """`run(algo)` is the folder of a short run, made once."""
-    done: dict[str, Path] = {}
+def run(logdir):
+    """`run(algo)` is the folder of a short run."""
+    return cache(lambda algo: train_to(STEPS, algo, logdir / "short"))
 
-    def train(algo: str) -> Path:
-        if algo not in done:
-            done[algo] = train_to(STEPS, algo, tmp_path_factory.mktemp(algo))
-        return done[algo]
 
-    return train
+@pytest.fixture(scope="module")
+def resumed(run, logdir):
+    """`resumed(algo)` is a copy of that folder after going on, whose metrics had suffered."""
+
+    @cache
+    def resume(algo: str) -> Path:
+        folder = logdir / "resumed" / algo
+        shutil.copytree(run(algo), folder)
+        with (folder / "metrics.jsonl").open("a") as file:
+            file.write('{"step": 9999, "train/score": 1.0}\n{"step": 10')  # past it; torn
+        assert cli.run(["resume", str(folder), f"--total-steps={MORE_STEPS}"]) == 0
+        return folder
+
+    return resume
 
 
 def train_to(steps: int, algo: str, logdir: Path) -> Path:
@@ -58,37 +66,30 @@ def metrics_of(folder: Path) -> list[dict]:
     return [{k: v for k, v in row.items() if not k.startswith("time/")} for row in rows]
 
 
-def learner_of(folder: Path, algo: str) -> dict[str, np.ndarray]:
+def learner_of(folder: Path) -> dict[str, np.ndarray]:
     """All that learning changes, from the newest checkpoint, by name."""
-    shape = jax.eval_shape(build(tiny(algo, ENV)).init, jax.random.key(0))
+    training = programs(read_config(folder)).training
+    shape = jax.eval_shape(training.init, jax.random.key(0))
     state = Checkpoints(folder / "checkpoints").restore("state", shape)
     return {name: np.asarray(leaf) for name, leaf in named(state.learner)}
 
 
 @EVERY
-def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(algo, run, tmp_path):
-    resumed = tmp_path / "resumed"
-    shutil.copytree(run(algo), resumed)
-    with (resumed / "metrics.jsonl").open("a") as file:
-        file.write('{"step": 9999, "train/score": 1.0}\n{"step": 10')  # past the checkpoint; torn
-    assert cli.run(["resume", str(resumed), f"--total-steps={MORE_STEPS}"]) == 0
-    whole = train_to(MORE_STEPS, algo, tmp_path)
-    assert metrics_of(resumed) == metrics_of(whole)
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(algo, resumed, logdir):
+    whole = train_to(MORE_STEPS, algo, logdir / "whole")
+    assert metrics_of(resumed(algo)) == metrics_of(whole)
     assert metrics_of(whole)[-1]["step"] >= MORE_STEPS
-    one, other = learner_of(resumed, algo), learner_of(whole, algo)
+    one, other = learner_of(resumed(algo)), learner_of(whole)
     for name in one:
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
 @EVERY
-def test_learning_moves_every_parameter_and_keeps_them_finite(algo, run, tmp_path):
+def test_learning_moves_every_parameter_and_keeps_them_finite(algo, run, resumed):
     learned = metrics_of(run(algo))[-1]
     assert learned["step"] >= STEPS and any(name.startswith("behaviour/") for name in learned)
     assert all(value is not None and np.isfinite(value) for value in learned.values())
-    further = tmp_path / "further"
-    shutil.copytree(run(algo), further)
-    assert cli.run(["resume", str(further), f"--total-steps={MORE_STEPS}"]) == 0
-    before, after = learner_of(run(algo), algo), learner_of(further, algo)
+    before, after = learner_of(run(algo)), learner_of(resumed(algo))
     assert all(np.isfinite(value).all() for value in after.values())
     still = [n for n in before if before[n].size > 1 and np.array_equal(before[n], after[n])]
     assert not still

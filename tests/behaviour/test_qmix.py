@@ -30,7 +30,7 @@ from mabl.behaviour.qmix import (
 from mabl.envs.coordination import CoordinationEnv
 from mabl.nets.mlp import MLP
 from mabl.training.loop import Training
-from mabl.training.run import build
+from mabl.training.programs import build
 from mabl.types import Replayed, TeamView, Trajectory
 
 # Few different configurations: each one's update is compiled anew.

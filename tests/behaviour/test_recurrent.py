@@ -28,7 +28,7 @@ from mabl.errors import UserError
 from mabl.execution import executor_of
 from mabl.nets.normaliser import Normaliser
 from mabl.rollout import Collector, Episodes, Rollout, advance
-from mabl.training.run import build
+from mabl.training.programs import build
 from mabl.types import TeamView, TimeStep
 
 # --- the filter -------------------------------------------------------------------------------

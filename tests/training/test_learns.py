@@ -9,9 +9,17 @@ from mabl.algorithms.registry import ALGORITHMS
 from mabl.envs.coordination import CoordinationEnv
 from mabl.evaluation import evaluate
 from mabl.execution import RandomExecutor
-from mabl.training.run import build, updates_due
+from mabl.training.programs import build
+from mabl.training.run import updates_due
 
 LAST_EPISODES, FIRST_EPISODES = 300, 200
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compile_well():
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

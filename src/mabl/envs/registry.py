@@ -76,9 +76,14 @@ def _entries() -> dict[str, Entry]:
     return {name: entry for family in FAMILIES.values() for name, entry in family().items()}
 
 
+def family(name: str) -> Callable[[], Mapping[str, Entry]]:
+    """Where an environment of that name would be found."""
+    return FAMILIES.get(name.partition("/")[0], dict)
+
+
 def make(name: str) -> CompiledEnv:
     """The environment of that name, e.g. `smax/3s_vs_4z`; `UserError` if there is none."""
-    entries = FAMILIES.get(name.partition("/")[0], dict)()
+    entries = family(name)()
     if name not in entries:
         raise unknown(name)
     return entries[name].make()

@@ -7,17 +7,14 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 from rich.console import Console
 
-from mabl.algorithms import registry as algorithms
 from mabl.algorithms.config import Config
 from mabl.algorithms.diagnostics import DIAGNOSED_ROWS
-from mabl.envs import registry as envs
 from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
 from mabl.runs import folder
@@ -26,10 +23,9 @@ from mabl.runs.metrics import MetricsLog, Row, read
 from mabl.training import curves
 from mabl.training.loop import Training, TrainState
 from mabl.training.memory import check_memory, free_memory, tree_bytes
+from mabl.training.programs import programs
 from mabl.training.progress import Progress, duration
 
-DIAGNOSE = 2**31 - 1
-"""Sets the diagnostics' random key apart from those that training splits off."""
 CURVES_EVERY = 30.0
 """Seconds between refreshes of curves.png."""
 
@@ -45,15 +41,13 @@ class Outcome:
 def train(config: Config, console: Console | None = None) -> Outcome:
     """Train from scratch, one run folder for each seed. Raises UserError for a user's mistake."""
     console = console or Console(stderr=True)
-    training = build(config)
     seeds = range(config.seed, config.seed + config.num_seeds)
-    check_memory_of(training, config.num_seeds, console)
+    check_memory_of(config, console)
     folders = [folder.create(config, seed) for seed in seeds]
     for path in folders:
         console.print(f"run folder {path}", highlight=False, soft_wrap=True)
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
-    state = eqx.filter_jit(jax.vmap(training.init))(keys)
-    return _run(training, state, folders, config.total_steps, console)
+    return _run(config, programs(config).init(keys), folders, console)
 
 
 def resume(
@@ -65,34 +59,28 @@ def resume(
     config = folder.read_config(path)
     if total_steps is not None:
         config = replace(config, total_steps=total_steps)
-    training = build(config)
     checkpoints = Checkpoints(path / "checkpoints", config.training.keep_checkpoints)
     if checkpoints.latest >= config.total_steps:
         raise UserError(
             f"{path} has already done {checkpoints.latest} of {config.total_steps} steps: "
             "give a larger --total-steps"
         )
-    shape = check_memory_of(training, 1, console)
+    shape = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), check_memory_of(config, console)
+    )
     state = checkpoints.restore("state", shape)
     folder.write_config(path, config)
-    return _run(
-        training,
-        jax.tree.map(lambda x: x[None], state),
-        [path],
-        config.total_steps,
-        console,
-        resumed=True,
-    )
+    return _run(config, jax.tree.map(lambda x: x[None], state), [path], console, resumed=True)
 
 
-def check_memory_of(training: Training, num_seeds: int, console: Console) -> TrainState:
-    """Say how much memory a run takes; shapes of a seed's state.
+def check_memory_of(config: Config, console: Console) -> TrainState:
+    """Say how much memory a run takes; shapes of its states, with a leading axis of seeds.
 
     Raises UserError if the replay does not fit.
     """
-    config = training.algorithm.config
-    shape = jax.eval_shape(training.init, jax.random.key(0))
-    replay, learner = num_seeds * tree_bytes(shape.replay), num_seeds * tree_bytes(shape.learner)
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), config.num_seeds))
+    shape = programs(config).init.eval_shape(keys)
+    replay, learner = tree_bytes(shape.replay), tree_bytes(shape.learner)
     console.print(
         f"{config.algo} on {config.env}: replay {replay / 2**20:,.0f} MiB, parameters and "
         f"optimisers {learner / 2**20:,.0f} MiB",
@@ -102,33 +90,20 @@ def check_memory_of(training: Training, num_seeds: int, console: Console) -> Tra
     return shape
 
 
-def build(config: Config) -> Training:
-    """The algorithm of a config in its environment."""
-    env = envs.make(config.env)
-    return Training(env, algorithms.make(config, env.spec))
-
-
 def _run(
-    training: Training,
+    config: Config,
     states: TrainState,
     folders: list[Path],
-    total_steps: int,
     console: Console,
     resumed: bool = False,
 ) -> Outcome:
-    """Cycle until every seed has done `total_steps`. `states` has a leading axis of seeds."""
-    config = training.algorithm.config
+    """Cycle until every seed is done. `states` has a leading axis of seeds."""
+    run = programs(config)
+    training, total_steps = run.training, config.total_steps
     keep = config.training.keep_checkpoints
     checkpoints = [Checkpoints(path / "checkpoints", keep, create=True) for path in folders]
     step = int(states.env_steps.min())
     logs = [MetricsLog(path, resume_at=step if resumed else None) for path in folders]
-    program = _over_seeds(training.cycle, len(folders), donate=True)
-    diagnose = _over_seeds(
-        lambda state: training.algorithm.diagnose(
-            state.learner, state.replay, jax.random.fold_in(state.key, DIAGNOSE)
-        ),
-        len(folders),
-    )
     saved, drawn, began = step, time.monotonic(), time.monotonic()
     console.print("compiling (cached for the next run) ...", highlight=False)
     with (
@@ -140,12 +115,12 @@ def _run(
             n_model, n_policy = updates_due(states, training)
             if n_model and int(states.model_updates[0]) < config.training.pretrain_updates:
                 console.print(f"pretraining the model: {n_model} updates ...", highlight=False)
-            states, metrics = program(states, n_model, n_policy)
+            states, metrics = run.cycle(states, n_model, n_policy)
             step = int(states.env_steps.min())
             if longest_lane(states) >= DIAGNOSED_ROWS and crossed(
                 before, step, config.training.diagnose_every
             ):
-                metrics |= diagnose(states)
+                metrics |= run.diagnose(states)
             metrics = jax.device_get(metrics)
             check_finite(states, step, checkpoints[0])
             seconds = time.monotonic() - cycle_began
@@ -242,22 +217,6 @@ def draw_curves(folders: list[Path], config: Config) -> None:
     """Refresh curves.png of every seed."""
     for path in folders:
         curves.draw(read(path), f"{config.algo} on {config.env}", path / "curves.png")
-
-
-def _over_seeds(function: Any, n_seeds: int, donate: bool = False) -> Any:
-    """Compile a function of one seed's state for all seeds; a single seed is spared the vmap.
-
-    The batched trip counts stay scalars, so that loops are not masked.
-    """
-
-    def mapped(states: TrainState, *counts: Any) -> Any:
-        if n_seeds > 1:
-            axes = (0, *[None] * len(counts))
-            return jax.vmap(function, in_axes=axes)(states, *counts)
-        one = jax.tree.map(lambda x: x[0], states)
-        return jax.tree.map(lambda x: x[None], function(one, *counts))
-
-    return jax.jit(mapped, donate_argnums=0 if donate else ())
 
 
 class _Interruption:
