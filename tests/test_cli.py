@@ -88,7 +88,7 @@ MISTAKES = {
     ),
     "capacity for an episode": (
         ["train", "--preset=paper", "--training.replay-capacity=60"],
-        "--training.replay-capacity 60 is too small for 1 environments of smax/3m: "
+        "--training.replay-capacity 60 is too small for 1 environment of smax/3m: "
         "give at least 61\n",
     ),
     "sequence": (

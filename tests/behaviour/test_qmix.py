@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.tiny import tiny
 
 from mabl.algorithms.base import Experience
+from mabl.algorithms.model_based import ModelBased
 from mabl.behaviour.actor import MaskedCategorical
 from mabl.behaviour.qmix import (
     QMIX,
@@ -32,6 +33,7 @@ from mabl.nets.mlp import MLP
 from mabl.training.loop import Training
 from mabl.training.programs import build
 from mabl.types import Replayed, TeamView, Trajectory
+from mabl.world_models.dreamer_v2 import DreamerV2
 
 # Few different configurations: each one's update is compiled anew.
 TINY = QMIXConfig(
@@ -476,3 +478,10 @@ def test_learning_in_imagination_leaves_the_world_model_alone():
     assert values.mixer.weight_in.layers[0].weight.shape[0] == global_size
     assert global_size == latent.global_.z.size
     assert values.q.layers[0].weight.shape[0] == model.actor_features(latent).shape[-1]
+
+
+def test_a_model_without_global_latents_is_refused():
+    config = tiny("mabl-qmix")
+    algorithm = ModelBased(DreamerV2, QMIX(config.qmix), CoordinationEnv().spec, config)
+    with pytest.raises(TypeError, match="QMIX mixes by global latents, and DreamerV2 has none"):
+        algorithm.init(KEY)

@@ -129,8 +129,9 @@ def make(config: Config, spec: EnvSpec) -> Algorithm:
         algorithm.rows_needed, plan.collect_steps or spec.episode_limit + 1
     )
     if plan.replay_capacity < needed:
+        environments = "environment" if plan.num_envs == 1 else "environments"
         raise UserError(
             f"--training.replay-capacity {plan.replay_capacity} is too small for "
-            f"{plan.num_envs} environments of {spec.name}: give at least {needed}"
+            f"{plan.num_envs} {environments} of {spec.name}: give at least {needed}"
         )
     return algorithm

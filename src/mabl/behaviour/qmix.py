@@ -174,7 +174,9 @@ class QMIX(NamedTuple):
         return EpsilonGreedy(state.values.q, state.epsilon)
 
     def critic_features(self, model: Any, latent: Any) -> Float[Array, "N G"]:
-        """z_global of every agent, for the mixer."""
+        """z_global of every agent, for the mixer. Raises TypeError for a model without."""
+        if not hasattr(model, "global_features"):
+            raise TypeError(f"QMIX mixes by global latents, and {type(model).__name__} has none")
         return model.global_features(latent)
 
     def value(self, state: QState, view: TeamView) -> Float[Array, " N"]:

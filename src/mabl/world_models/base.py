@@ -33,7 +33,8 @@ class WorldModelConfig:
     n_classes: int = 32
     """Classes of each categorical."""
     agent_prior_input: Literal["prior", "posterior"] = "prior"
-    """Global sample behind the agent prior in training (sec. 3.2: prior, app. A: posterior)."""
+    """Global sample behind the agent prior in training (sec. 3.2: prior, app. A: posterior);
+    models of one level have none."""
     obs_weight: float = 1.0
     """Weight of the observations' loss."""
     reward_input: Literal["agent", "both"] = "agent"
