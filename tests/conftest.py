@@ -12,6 +12,7 @@ os.environ.setdefault(
 )
 
 import jax
+import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -20,3 +21,10 @@ jax.config.update("jax_disable_most_optimizations", True)
 
 def pytest_configure(config):
     config.addinivalue_line("filterwarnings", r"error:::mabl(\..*)?")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_programs():
+    """Programs hold on to thousands of memory maps each, and a process may have 65,530 in all."""
+    yield
+    jax.clear_caches()
