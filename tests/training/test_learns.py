@@ -15,18 +15,19 @@ from mabl.training.run import updates_due
 LAST_EPISODES, FIRST_EPISODES = 300, 200
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _compile_well():
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
+@pytest.fixture
+def compile_well():
+    """From its call to the end of a test: here is something to compute."""
+    yield lambda: jax.config.update("jax_disable_most_optimizations", False)
     jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_it_learns_to_remember_and_to_coordinate(algo):
+def test_it_learns_to_remember_and_to_coordinate(algo, compile_well):
     config = preset("quick", "test/coordination", algo)
     training = build(config)
     state = jax.jit(training.init)(jax.random.key(0))
+    compile_well()
     cycle = jax.jit(training.cycle, donate_argnums=0)
     scores, counts = [], []
     while int(state.env_steps) < config.total_steps:

@@ -114,7 +114,7 @@ _MAMBA_PAPER = {
 }
 # Talking is slower to learn than listening to oneself.
 _MAMBA_TEST = {
-    "total_steps": 12_000,
+    "total_steps": 9_000,
     "training": {"model_updates": 20},
     "world_model": {"learning_rate": 1e-3},
     "communication": {"n_layers": 1},
