@@ -36,6 +36,8 @@ WINDOW = 4_000
 """Environment steps over which training episodes are averaged in curves."""
 LAST = 15_000
 """Environment steps at the end that the table averages over, as the paper's table 1."""
+EARLY = 20_000
+"""Environment steps at which the table looks at win rates early on."""
 EPISODES = 256
 """Greedy episodes after training."""
 COLUMNS = ("step", "train/episodes", "train/win_rate", "train/episode_return", "time/seconds")
@@ -186,8 +188,8 @@ def draw(env: str, algos: list[str], raw: Path, out: Path) -> None:
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     won, earned = figure.subplots(1, 2)
     print(
-        "| | win rate, last 15k steps | return, last 15k | greedy win rate | steps to 50% wins | "
-        "minutes | parameters |\n|---|---|---|---|---|---|---|"
+        "| | win rate at 20k | last 15k steps | return, last 15k steps | greedy win rate | "
+        "steps to 50% wins | minutes | parameters |\n|---|---|---|---|---|---|---|---|"
     )
     for algo, runs in groups.items():
         style = {"linestyle": "-" if ALGORITHMS[algo].decentralised else "--"}
@@ -206,8 +208,9 @@ def draw(env: str, algos: list[str], raw: Path, out: Path) -> None:
             ]
             for name in ("wins", "returns")
         ]
+        early = [mean_between(run, run.wins, EARLY - WINDOW, EARLY) for run in runs]
         print(
-            f"| {algo} | {listed(last[0])} | {listed(last[1])} "
+            f"| {algo} | {listed(early)} | {listed(last[0])} | {listed(last[1])} "
             f"| {listed([r.summary['greedy_win_rate'] for r in runs])} "
             f"| {', '.join(f'{k:,}' if k else 'never' for k in reached)} "
             f"| {np.mean([r.summary['seconds'] for r in runs]) / 60:.1f} "

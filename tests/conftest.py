@@ -25,6 +25,14 @@ def pytest_configure(config):
     config.addinivalue_line("filterwarnings", r"error:::mabl(\..*)?")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Tests of a module belong to one worker, which makes their fixtures and programs once."""
+    for item in items:
+        if not item.get_closest_marker("xdist_group"):
+            item.add_marker(pytest.mark.xdist_group(item.module.__name__))
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
     """Programs hold on to thousands of memory maps each, and a process may have 65,530 in all."""

@@ -376,8 +376,16 @@ def test_the_behaviour_updates_from_the_values_of_replayed_rows_if_they_count(fr
     real = jax.tree.map(lambda *x: jnp.concatenate(x), *values)
     assert real.target.shape == real.view.alive.shape == (12, 2)
     expected, _ = mappo.update(fresh, trajectory, key, config, real if coef else None)
-    for x, y in zip(leaves(after), leaves(expected), strict=True):
-        assert_allclose(x, y, rtol=1e-4, atol=1e-6)
+
+    def heard(state):
+        """What the networks say; biases of keys, which say nothing, are moved by rounding alone."""
+        view = jax.tree.map(lambda x: x[0], trajectory.view)
+        policy = jax.vmap(jax.vmap(state.actor))(view.actor_features, view.available)
+        return policy.log_probs, jax.vmap(state.critic)(view.critic_features)
+
+    for x, y in zip(heard(after), heard(expected), strict=True):
+        assert_allclose(x, y, rtol=1e-4, atol=1e-5)
+    assert not np.allclose(heard(after)[1], heard(fresh)[1], atol=1e-3)
     assert ("behaviour/replay_critic_loss" in metrics) == (coef > 0)
 
 

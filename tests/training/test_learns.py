@@ -22,7 +22,9 @@ def compile_well():
     jax.config.update("jax_disable_most_optimizations", True)
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize(
+    "algo", [pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ALGORITHMS]
+)
 def test_it_learns_to_remember_and_to_coordinate(algo, compile_well):
     config = preset("quick", "test/coordination", algo)
     training = build(config)
