@@ -192,7 +192,10 @@ def draw(env: str, algos: list[str], raw: Path, out: Path) -> None:
         "steps to 50% wins | minutes | parameters |\n|---|---|---|---|---|---|---|---|"
     )
     for algo, runs in groups.items():
-        style = {"linestyle": "-" if ALGORITHMS[algo].decentralised else "--"}
+        style = {
+            "linestyle": "-" if ALGORITHMS[algo].decentralised else "--",
+            "color": f"C{list(ALGORITHMS).index(algo)}",  # the same in every picture
+        }
         rates = np.stack([curve(run, run.wins, grid) for run in runs])
         draw_band(won, grid, algo, rates, style)
         returns = np.stack([curve(run, run.returns, grid) for run in runs])
@@ -216,7 +219,7 @@ def draw(env: str, algos: list[str], raw: Path, out: Path) -> None:
             f"| {np.mean([r.summary['seconds'] for r in runs]) / 60:.1f} "
             f"| {runs[0].summary['parameters']:,} |"
         )
-    won.set(ylabel="win rate in training", ylim=(0, 1))
+    won.set(ylabel="win rate in training", ylim=(0, None))
     earned.set(ylabel="episode return in training", ylim=(0, None))
     for axis in (won, earned):
         axis.set(xlabel="environment steps")
