@@ -188,13 +188,14 @@ def draw(env: str, algos: list[str], raw: Path, out: Path) -> None:
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     won, earned = figure.subplots(1, 2)
     print(
-        "| | win rate at 20k | last 15k steps | return, last 15k steps | greedy win rate | "
-        "steps to 50% wins | minutes | parameters |\n|---|---|---|---|---|---|---|---|"
+        f"| | win rate at {EARLY // 1000}k | win rate, last {LAST // 1000}k steps "
+        f"| return, last {LAST // 1000}k steps | greedy win rate | steps to 50% wins | minutes "
+        "| parameters |\n|---|---|---|---|---|---|---|---|"
     )
     for algo, runs in groups.items():
         style = {
             "linestyle": "-" if ALGORITHMS[algo].decentralised else "--",
-            "color": f"C{list(ALGORITHMS).index(algo)}",  # the same in every picture
+            "color": f"C{list(ALGORITHMS).index(algo)}",  # one colour in all pictures
         }
         rates = np.stack([curve(run, run.wins, grid) for run in runs])
         draw_band(won, grid, algo, rates, style)

@@ -4,17 +4,21 @@ They are compiled quickly instead of well: most tests compute next to nothing.
 """
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR",
     str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mabl" / "jax-tests"),
 )
-# Together with optimisations off, below, this saves a third of the time to compile.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
+# Together with optimisations off, below, this saves a third of the time to compile. Later versions
+# of jaxlib do not know the flag, and abort at one that they do not know.
+FLAG = "--xla_cpu_use_fusion_emitters=false"
+if version("jaxlib").startswith("0.10.") and FLAG not in os.environ.get("XLA_FLAGS", ""):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}"
 
-import jax
-import pytest
+import jax  # noqa: E402
+import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -37,4 +41,7 @@ def pytest_collection_modifyitems(items):
 def _forget_programs():
     """Programs hold on to thousands of memory maps each, and a process may have 65,530 in all."""
     yield
+    from mabl.training.programs import forget_programs  # not before its types are checked
+
+    forget_programs()
     jax.clear_caches()

@@ -77,14 +77,13 @@ def train(arguments: list[str]) -> int:
 def parse_config(arguments: list[str], default: "Config") -> "Config":
     """`default` with flags applied; sections that the algorithm does not read have no flags."""
     from mabl.algorithms.config import Config
-    from mabl.algorithms.registry import entry
+    from mabl.algorithms.registry import unread
 
-    unread = [
+    hidden = [
         (section, Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress], getattr(default, section))
-        for section in Config.sections()
-        if section not in entry(default.algo).sections
+        for section in unread(default.algo)
     ]
-    flags = make_dataclass("Config", unread, bases=(Config,), frozen=True)
+    flags = make_dataclass("Config", hidden, bases=(Config,), frozen=True)
     given = tyro.cli(
         flags,
         args=arguments,

@@ -23,7 +23,8 @@ def compile_well():
 
 
 @pytest.mark.parametrize(
-    "algo", [pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ALGORITHMS]
+    "algo",
+    [pytest.param(name, marks=pytest.mark.xdist_group(f"learns-{name}")) for name in ALGORITHMS],
 )
 def test_it_learns_to_remember_and_to_coordinate(algo, compile_well):
     config = preset("quick", "test/coordination", algo)

@@ -10,6 +10,7 @@ from mabl.algorithms import registry as algorithms
 from mabl.algorithms.presets import preset
 from mabl.envs import registry as envs
 from mabl.runs.checkpoint import named
+from mabl.runs.folder import read_config, write_config
 from mabl.training.programs import programs
 
 CONFIG = tiny("mabl")
@@ -39,6 +40,14 @@ def test_what_is_registered_anew_under_a_name_has_its_own(monkeypatch):
 def model_of(run):
     """The world model that a run starts with, as shapes."""
     return jax.eval_shape(run.training.init, jax.random.key(0)).learner.model
+
+
+@pytest.mark.parametrize("algo", algorithms.ALGORITHMS)
+def test_a_run_folder_gives_back_the_programs(algo, tmp_path):
+    """What an algorithm does not read is not written down, and makes no difference."""
+    config = preset("quick", "test/coordination", algo)
+    write_config(tmp_path, config)
+    assert programs(read_config(tmp_path)) is programs(config)
 
 
 @pytest.mark.parametrize("env", ["test/counting", "smax/3m"])

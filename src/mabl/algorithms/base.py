@@ -31,7 +31,7 @@ class Algorithm(Protocol):
 
     @property
     def config(self) -> Config:
-        """The run's."""
+        """The run's, but for seed, length and folder, on which nothing compiled may depend."""
         ...
 
     @property

@@ -114,7 +114,7 @@ _MAMBA_PAPER = {
 }
 # Talking is slower to learn than listening to oneself.
 _MAMBA_TEST = {
-    "total_steps": 9_000,
+    "total_steps": 10_000,
     "training": {"model_updates": 20},
     "world_model": {"learning_rate": 1e-3},
     "communication": {"n_layers": 1},
@@ -168,7 +168,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
         },
     },
 }
-"""The same for an algorithm, by (preset, family, algorithm)."""
+"""Fields that an algorithm changes, and fields of its sections, by (preset, family, algo)."""
 
 
 def preset(name: str, env: str, algo: str) -> Config:

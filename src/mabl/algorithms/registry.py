@@ -114,6 +114,11 @@ def entry(name: str) -> Entry:
     return ALGORITHMS[name]
 
 
+def unread(algo: str) -> list[str]:
+    """Sections of the configuration that an algorithm does not read."""
+    return [name for name in Config.sections() if name not in entry(algo).sections]
+
+
 def make(config: Config, spec: EnvSpec) -> Algorithm:
     """The algorithm of `config` for an environment.
 

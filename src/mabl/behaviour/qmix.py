@@ -174,7 +174,7 @@ class QMIX(NamedTuple):
         return EpsilonGreedy(state.values.q, state.epsilon)
 
     def critic_features(self, model: Any, latent: Any) -> Float[Array, "N G"]:
-        """z_global of every agent, for the mixer. Raises TypeError for a model without."""
+        """z_global of every agent, for the mixer. Raises TypeError for a model without them."""
         if not hasattr(model, "global_features"):
             raise TypeError(f"QMIX mixes by global latents, and {type(model).__name__} has none")
         return model.global_features(latent)

@@ -19,7 +19,7 @@ from pathlib import Path
 import yaml
 
 from mabl.algorithms.config import Config, from_dict
-from mabl.algorithms.registry import entry
+from mabl.algorithms.registry import unread
 from mabl.errors import UserError
 
 RECORDED_PACKAGES = ("mabl", "jax", "jaxlib", "equinox", "optax", "orbax-checkpoint", "jaxmarl")
@@ -74,8 +74,9 @@ def read_config(folder: Path) -> Config:
 
 def write_config(folder: Path, config: Config) -> None:
     """Record a changed configuration, e.g. more steps after a resume."""
-    unread = set(Config.sections()) - set(entry(config.algo).sections)
-    data = {name: x for name, x in dataclasses.asdict(config).items() if name not in unread}
+    data = dataclasses.asdict(config)
+    for name in unread(config.algo):
+        del data[name]
     write_yaml(folder / "config.yaml", data)
 
 

@@ -35,14 +35,19 @@ def build(config: Config) -> Training:
 
 
 def programs(config: Config) -> Programs:
-    """The programs of a run. Runs that differ in seed, length or folder alone share them."""
-    same = replace(config, seed=0, total_steps=1, logdir="")
+    """The programs of a run. Runs that differ in seed, length or folder alone share them.
+
+    No program may depend on these: in `training.algorithm.config` they are not the run's.
+    """
+    plain = Config()
+    unread = {name: getattr(plain, name) for name in algorithms.unread(config.algo)}
+    same = replace(config, preset="quick", seed=0, total_steps=1, logdir="", **unread)
     return _programs(same, algorithms.entry(config.algo), envs.family(config.env))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=2)
 def _programs(config: Config, *registered: Any) -> Programs:
-    """What is registered under a name is part of the key, lest a new one meet old programs."""
+    """Another entry registered under a name has programs of its own; what it names is not seen."""
     del registered
     training = build(config)
 
@@ -56,6 +61,10 @@ def _programs(config: Config, *registered: Any) -> Programs:
         cycle=_over_seeds(training.cycle, config.num_seeds, donate=True),
         diagnose=_over_seeds(diagnose, config.num_seeds),
     )
+
+
+forget_programs = _programs.cache_clear
+"""Lets go of them."""
 
 
 def _over_seeds(function: Any, n_seeds: int, donate: bool = False) -> Any:
