@@ -54,7 +54,7 @@ def start(env: CompiledEnv, executor: Executor, key: PRNGKey) -> Collector:
 
 
 def strong(x: Array) -> Array:
-    """Without JAX's weak type, which no checkpoint keeps: a resumed run would be traced anew."""
+    """Without JAX's weak type: what differs in it alone, as restored rows do, is traced anew."""
     return x if jnp.issubdtype(x.dtype, jax.dtypes.extended) else x.astype(x.dtype)
 
 
@@ -67,7 +67,7 @@ def advance(
     memory, action = executor.act(collector.memory, row, key_act)
     stepped = env.step(key_step, collector.env_state, action)
     began = env.reset(key_reset)
-    env_state, row = jax.tree.map(lambda a, b: jnp.where(over, a, b), began, stepped)
+    env_state, row = jax.tree.map(lambda a, b: strong(jnp.where(over, a, b)), began, stepped)
     collector = Collector(
         env_state=env_state,
         row=row,
