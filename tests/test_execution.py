@@ -17,7 +17,7 @@ from mabl.execution import (
     act_alone,
     executor_of,
 )
-from mabl.types import TimeStep
+from mabl.rows import TimeStep
 from mabl.world_models.levels import AgentFilter, Level
 
 SPACE = Discrete(4)

@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 
 from mabl import replay as replays
 from mabl.envs.counting import CountingEnv
-from mabl.types import TimeStep
+from mabl.rows import TimeStep
 
 CAPACITY, CHUNK, LENGTH, SAMPLES = 7, 4, 3, 1024
 STALE = -7

@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 
 from mabl.envs.counting import CountingEnv
 from mabl.rollout import Rollout, rollout, start
-from mabl.types import TimeStep
+from mabl.rows import TimeStep
 
 ENV = CountingEnv()
 

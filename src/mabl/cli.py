@@ -123,12 +123,16 @@ class EvalArguments:
     """Evaluate a baseline instead of a run; needs --env."""
     env: str | None = None
     """Environment; default: the run's own."""
+    env_kwargs: tuple[str, ...] = ()
+    """Arguments that it is made with: KEY=VALUE, values in YAML."""
     episodes: int = 32
     """Episodes to play."""
     greedy: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
     """Take the likeliest action; --no-greedy or --sample draws it from the policy."""
     seed: int = 0
     """Decides the episodes."""
+    num_workers: int | None = None
+    """Processes for environments that run in Python; 0: this one; None: one a core."""
     json: bool = False
     """Print one JSON object."""
 
@@ -152,7 +156,7 @@ def evaluate(arguments: list[str]) -> int:
     if given.run is not None:
         from mabl.policy import load_run
 
-        loaded = load_run(given.run, given.env, given.greedy)
+        loaded = load_run(given.run, given.env, given.env_kwargs, given.greedy)
         env, executor = loaded.env, loaded.executor
         subject = {"run": str(given.run), "step": loaded.step, "greedy": given.greedy}
     else:
@@ -160,10 +164,10 @@ def evaluate(arguments: list[str]) -> int:
             raise UserError(f"--policy {given.policy} needs --env: mabl envs lists them")
         from mabl.envs import registry
 
-        env = registry.make(given.env)
+        env = registry.make(given.env, given.env_kwargs)
         executor = baseline(given.policy or "", env)
         subject = {"policy": given.policy}
-    results = play(env, executor, jax.random.key(given.seed), given.episodes)
+    results = play(env, executor, jax.random.key(given.seed), given.episodes, given.num_workers)
     numbers = {"env": env.spec.name, **subject, **summary(results, env.spec)}
     if given.json:
         print(json.dumps(numbers))
@@ -185,7 +189,7 @@ def list_envs(arguments: list[str]) -> None:
     for name in rows[0]._fields:
         table.add_column(name.replace("_", " "), no_wrap=name == "name")
     for row in rows:
-        table.add_row(*map(str, row))
+        table.add_row(*("-" if value is None else str(value) for value in row))
     print_table(table)
 
 

@@ -29,10 +29,10 @@ def require_positive(config: object, *names: str) -> None:
 
 
 def require_between(config: object, low: float, high: float, *names: str) -> None:
-    """Raise UserError unless each named field of a config lies in [low, high]."""
+    """Raise UserError unless each named field of a config is None or lies in [low, high]."""
     for name in names:
         value = getattr(config, name)
-        if not low <= value <= high:
+        if value is not None and not low <= value <= high:
             raise _out_of_range(config, name, value, f"a number from {low:g} to {high:g}")
 
 

@@ -1,6 +1,7 @@
 """Playing whole episodes with fixed policies, and summing them up."""
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,13 +9,20 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mabl.envs.base import CompiledEnv, EnvSpec
+from mabl.envs.host import Hosted
+from mabl.envs.pool import Pool, open_pool
 from mabl.errors import UserError
-from mabl.execution import Executor, RandomExecutor
+from mabl.execution import Executor, Memory, RandomExecutor
+from mabl.host_rollout import HostRollouts, act_where, start_hosted
 from mabl.rollout import rollout, start
 from mabl.types import PRNGKey
 
 PARALLEL = 64
-"""Episodes played side by side."""
+"""Episodes played side by side where environments are compiled."""
+HOSTED_PARALLEL = 8
+"""The same where they run in Python."""
+HOSTED_TIMEOUT = 60.0
+"""Seconds that a step may take there."""
 
 
 class Results(NamedTuple):
@@ -27,9 +35,24 @@ class Results(NamedTuple):
     score: Float[Array, " E"]
 
 
-def evaluate(env: CompiledEnv, executor: Executor, key: PRNGKey, episodes: int) -> Results:
-    """Play `episodes` independent episodes to their ends."""
+def evaluate(
+    env: CompiledEnv | Hosted,
+    executor: Executor,
+    key: PRNGKey,
+    episodes: int,
+    num_workers: int | None = None,
+) -> Results:
+    """Play `episodes` independent episodes to their ends; with workers if the environment needs."""
+    if not isinstance(env, Hosted):
+        return _play_compiled(env, executor, key, episodes)
+    pool = open_pool(env, min(episodes, HOSTED_PARALLEL), num_workers, HOSTED_TIMEOUT)
+    try:
+        return _play_hosted(pool, env.spec, executor, key, episodes)
+    finally:
+        pool.close()
 
+
+def _play_compiled(env: CompiledEnv, executor: Executor, key: PRNGKey, episodes: int) -> Results:
     @eqx.filter_jit
     def play(executor: Executor, keys: Array) -> Results:
         def one(key: PRNGKey) -> Results:
@@ -48,6 +71,35 @@ def evaluate(env: CompiledEnv, executor: Executor, key: PRNGKey, episodes: int) 
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:episodes], *played)
 
 
+def _play_hosted(
+    pool: Pool, spec: EnvSpec, executor: Executor, key: PRNGKey, episodes: int
+) -> Results:
+    key, key_start = jax.random.split(key)
+    n_envs = len(pool.slots.command)
+    collectors = jax.vmap(lambda key: start_hosted(spec, executor, key))(
+        jax.random.split(key_start, n_envs)
+    )
+    rollouts = HostRollouts(pool, spec, spec.episode_limit + 1, one_episode=True)
+
+    @eqx.filter_jit
+    def act(executor: Executor, *of_envs: Any) -> tuple[Memory, Array]:
+        return jax.vmap(partial(act_where, executor))(*of_envs)
+
+    played: list[Results] = []
+    while sum(len(batch.length) for batch in played) < episodes:
+        key, key_batch = jax.random.split(key)
+        keys = jax.random.split(key_batch, n_envs)
+        landed = rollouts.collect(
+            lambda memory, row, count, go, keys=keys: act(executor, memory, row, keys, count, go),
+            collectors,
+        )
+        collectors, ended = landed.after, landed.rollout.episodes
+        whole = ended.ended.any(-1)  # those of lost workers are not
+        sums = (ended.episode_return.sum(-1), ended.length.sum(-1), ended.score.sum(-1))
+        played.append(Results(*(column[whole] for column in sums)))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:episodes], *played)
+
+
 def summary(results: Results, spec: EnvSpec) -> dict[str, float | int]:
     """Mean and standard deviation over episodes of score, return and length."""
     columns = {
@@ -62,7 +114,7 @@ def summary(results: Results, spec: EnvSpec) -> dict[str, float | int]:
     return numbers | {"episodes": len(results.score)}
 
 
-def baseline(name: str, env: CompiledEnv) -> Executor:
+def baseline(name: str, env: CompiledEnv | Hosted) -> Executor:
     """A policy that learned nothing: `random`, or the environment's own `heuristic`.
 
     Raises UserError if the environment has no heuristic.

@@ -8,7 +8,8 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.behaviour.base import ActorFunction
 from mabl.envs.base import ActionSpace, Discrete
-from mabl.types import PRNGKey, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import PRNGKey
 from mabl.world_models.levels import forget, team_of
 
 Memory = Any

@@ -1,5 +1,6 @@
 """A trained policy, taken away: by one agent with its own observations, or by a whole team."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,24 +13,30 @@ from mabl.algorithms import registry as algorithms
 from mabl.algorithms.config import Config
 from mabl.envs import registry as envs
 from mabl.envs.base import CompiledEnv, EnvSpec
+from mabl.envs.host import Hosted
 from mabl.errors import UserError
 from mabl.execution import JointExecutor, LocalExecutor, act_alone, executor_of
+from mabl.rows import TimeStep
 from mabl.runs import folder
 from mabl.runs.checkpoint import Checkpoints
-from mabl.types import TimeStep
 
 
 class LoadedRun(NamedTuple):
     """What a run folder holds, ready to act."""
 
     config: Config
-    env: CompiledEnv
+    env: CompiledEnv | Hosted
     executor: LocalExecutor | JointExecutor
     step: int
     """Environment steps at which the checkpoint was written."""
 
 
-def load_run(path: Path | str, env: str | None = None, greedy: bool = True) -> LoadedRun:
+def load_run(
+    path: Path | str,
+    env: str | None = None,
+    env_kwargs: Sequence[str] = (),
+    greedy: bool = True,
+) -> LoadedRun:
     """The newest checkpoint's policy, in its own environment or in `env`.
 
     Raises UserError if the folder is not a run or if the policy does not fit the environment.
@@ -37,8 +44,8 @@ def load_run(path: Path | str, env: str | None = None, greedy: bool = True) -> L
     path = Path(path)
     config = folder.read_config(path)
     checkpoints = Checkpoints(path / "checkpoints")
-    trained_in = envs.make(config.env)
-    played_in = envs.make(env) if env else trained_in
+    trained_in = envs.make(config.env, config.env_kwargs)
+    played_in = envs.make(env, env_kwargs) if env else trained_in
     check_fits(trained_in.spec, played_in.spec)
     algorithm = algorithms.make(config, trained_in.spec)
     shape = jax.eval_shape(lambda key: algorithm.policy(algorithm.init(key)), jax.random.key(0))

@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
-from mabl.types import PRNGKey, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import PRNGKey
 
 
 class Replay(NamedTuple):
@@ -40,6 +41,14 @@ def add(replay: Replay, rows: TimeStep, count: Int[Array, ""]) -> Replay:
         cursor=(replay.cursor + count) % capacity,
         size=jnp.minimum(replay.size + count, capacity),
     )
+
+
+def cut(replay: Replay, truncated: Bool[Array, ""]) -> Replay:
+    """Truncate the episode at the newest row, if there is one."""
+    rows, newest = replay.rows, (replay.cursor - 1) % replay.rows.truncated.shape[0]
+    was = rows.truncated[newest]
+    now = rows.truncated.at[newest].set(was | (truncated & (replay.size > 0)))
+    return replay._replace(rows=rows._replace(truncated=now))
 
 
 def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int) -> TimeStep:

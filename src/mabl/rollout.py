@@ -4,11 +4,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from mabl.envs.base import CompiledEnv, EnvState
 from mabl.execution import Executor, Memory
-from mabl.types import PRNGKey, TimeStep, is_last
+from mabl.rows import TimeStep, is_last
+from mabl.types import PRNGKey
 
 
 class Collector(NamedTuple):
@@ -58,11 +59,16 @@ def strong(x: Array) -> Array:
     return x if jnp.issubdtype(x.dtype, jax.dtypes.extended) else x.astype(x.dtype)
 
 
+def row_keys(key: PRNGKey) -> Key[Array, "3"]:
+    """For acting, stepping and resetting at one row."""
+    return jax.random.split(key, 3)
+
+
 def advance(
     env: CompiledEnv, executor: Executor, collector: Collector, key: PRNGKey
 ) -> tuple[Collector, Episodes]:
     """The next row: a step, or a reset if the newest row ended its episode."""
-    key_act, key_step, key_reset = jax.random.split(key, 3)
+    key_act, key_step, key_reset = row_keys(key)
     row, over = collector.row, is_last(collector.row)
     memory, action = executor.act(collector.memory, row, key_act)
     stepped = env.step(key_step, collector.env_state, action)

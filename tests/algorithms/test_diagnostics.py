@@ -7,7 +7,8 @@ import pytest
 from mabl.algorithms.diagnostics import diagnose, masked_mean, open_loop_error, unexplained
 from mabl.envs.base import Discrete, EnvSpec
 from mabl.envs.counting import CountingEnv
-from mabl.types import Metrics, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import Metrics
 from mabl.world_models.base import WorldModelConfig, observe_sequence
 from mabl.world_models.mabl import MABL
 

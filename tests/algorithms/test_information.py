@@ -15,7 +15,7 @@ from mabl.algorithms.base import Algorithm
 from mabl.algorithms.registry import ALGORITHMS, COLUMNS
 from mabl.envs.base import Discrete, EnvSpec
 from mabl.execution import executor_of
-from mabl.types import TimeStep
+from mabl.rows import TimeStep
 from mabl.world_models.base import observe_sequence
 
 AGENTS, OBS, STEPS = 3, 5, 4

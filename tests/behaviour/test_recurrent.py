@@ -28,8 +28,9 @@ from mabl.errors import UserError
 from mabl.execution import executor_of
 from mabl.nets.normaliser import Normaliser
 from mabl.rollout import Collector, Episodes, Rollout, advance
+from mabl.rows import TimeStep
 from mabl.training.programs import build
-from mabl.types import TeamView, TimeStep
+from mabl.types import TeamView
 
 # --- the filter -------------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ from jaxmarl.environments.smax import HeuristicEnemySMAX
 from mabl.envs import registry, smax
 from mabl.envs.smax_terrain import STOP, TerrainSMAX, attack_closest
 from mabl.errors import UserError
-from mabl.types import is_last
+from mabl.rows import is_last
 
 
 class Played:

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mabl.envs.base import Continuous, Discrete, EnvSpec
 from mabl.losses.kl import balanced_kl
-from mabl.types import TimeStep
+from mabl.rows import TimeStep
 from mabl.world_models.base import (
     WorldModelConfig,
     decoder_losses,

@@ -24,8 +24,8 @@ from mabl.imagination import Dream, ImaginationConfig, Imagined
 from mabl.losses.kl import categorical_kl
 from mabl.nets.mlp import MLP
 from mabl.replay import sample_sequences
+from mabl.rows import TimeStep
 from mabl.training.programs import build as build_training
-from mabl.types import TimeStep
 from mabl.world_models.base import (
     WorldModelConfig,
     decoder_losses,

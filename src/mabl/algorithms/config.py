@@ -81,6 +81,8 @@ class Config:
 
     env: str = "smax/3m"
     """Environment: `mabl envs` lists them."""
+    env_kwargs: tuple[str, ...] = ()
+    """Arguments that it is made with: KEY=VALUE, values in YAML."""
     algo: str = "mabl"
     """Algorithm: `mabl algos` lists them."""
     preset: Literal["quick", "paper"] = "quick"
@@ -93,6 +95,10 @@ class Config:
     """Train seeds `seed .. seed + K - 1` in one program, each in its own run folder."""
     logdir: str = "runs"
     """Where run folders go: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP."""
+    num_workers: int | None = None
+    """Processes for environments that run in Python; 0: the learner's own; None: one a core."""
+    worker_timeout: float = 60.0
+    """Seconds that they may take for a step before they are replaced."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
     communication: CommunicationConfig = field(default_factory=CommunicationConfig)
@@ -108,7 +114,8 @@ class Config:
         return [f.name for f in fields(cls) if is_dataclass(f.type)]
 
     def __post_init__(self) -> None:
-        require_positive(self, "total_steps", "num_seeds")
+        require_positive(self, "total_steps", "num_seeds", "worker_timeout")
+        require_between(self, 0, inf, "num_workers")
         require_between(self, 0, 2**32 - self.num_seeds, "seed")
 
 
@@ -141,5 +148,8 @@ def _value(hint: Any, value: Any, path: str) -> Any:
         return float(value)
     if type(value) in options:
         return value
+    if typing.get_origin(hint) is tuple and isinstance(value, list):
+        item = typing.get_args(hint)[0]
+        return tuple(_value(item, part, f"{path}[{i}]") for i, part in enumerate(value))
     expected = " or ".join(getattr(option, "__name__", str(option)) for option in options)
     raise UserError(f"config field {path} is {value!r}: give {expected}")

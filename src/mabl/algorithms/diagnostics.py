@@ -8,7 +8,8 @@ import optax
 from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import ActionSpace
-from mabl.types import Metrics, PRNGKey, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import Metrics, PRNGKey
 from mabl.world_models.base import WorldModel
 from mabl.world_models.heads import Predictions
 

@@ -18,7 +18,8 @@ from mabl.envs.base import EnvSpec
 from mabl.execution import Policy
 from mabl.imagination import Dream, Imagined, Step, imagine_trajectory
 from mabl.replay import Replay, sample_sequences
-from mabl.types import Metrics, PRNGKey, Replayed, TeamView, TimeStep, is_last
+from mabl.rows import TimeStep, is_last
+from mabl.types import Metrics, PRNGKey, Replayed, TeamView
 from mabl.world_models.base import WorldModel, WorldModelConfig, model_loss, observe_sequence
 
 N_DIAGNOSED = 128

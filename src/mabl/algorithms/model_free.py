@@ -28,7 +28,8 @@ from mabl.errors import UserError
 from mabl.execution import Policy
 from mabl.nets.normaliser import Normaliser
 from mabl.replay import Replay
-from mabl.types import Metrics, PRNGKey, TeamView, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import Metrics, PRNGKey, TeamView
 
 
 class PolicyLearner(NamedTuple):

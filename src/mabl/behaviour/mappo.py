@@ -18,7 +18,8 @@ from mabl.behaviour.critic import Critic
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.ppo import clipped_surrogate
 from mabl.losses.returns import lambda_returns
-from mabl.types import Metrics, PRNGKey, Replayed, TeamView, TimeStep, Trajectory
+from mabl.rows import TimeStep
+from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,18 @@
-"""What an environment is to the rest of the house."""
+"""What an environment is to the rest of the house. This module does not import jax: see `rows`."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import jax
-import jax.numpy as jnp
-from jax.typing import DTypeLike
-from jaxtyping import Array, Float, Shaped
+import numpy as np
 
-from mabl.types import PRNGKey, TimeStep
+from mabl.rows import TimeStep
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float, Shaped
+
+    from mabl.types import PRNGKey
 
 EnvState = Any
 
@@ -25,9 +29,9 @@ class Discrete:
         return ()
 
     @property
-    def dtype(self) -> DTypeLike:
+    def dtype(self) -> type[np.generic]:
         """Of an action."""
-        return jnp.int32
+        return np.int32
 
     @property
     def size(self) -> int:
@@ -36,6 +40,8 @@ class Discrete:
 
     def encode(self, action: Shaped[Array, "*b"]) -> Float[Array, "*b A"]:
         """One-hot vectors: what networks see of an action."""
+        import jax
+
         return jax.nn.one_hot(action, self.n)
 
 
@@ -51,9 +57,9 @@ class Continuous:
         return (self.size,)
 
     @property
-    def dtype(self) -> DTypeLike:
+    def dtype(self) -> type[np.generic]:
         """Of an action."""
-        return jnp.float32
+        return np.float32
 
     def encode(self, action: Float[Array, "*b A"]) -> Float[Array, "*b A"]:
         """The action itself."""
@@ -76,6 +82,12 @@ class EnvSpec:
     """Joint steps after which an episode is truncated."""
     score_name: str
     """What `TimeStep.score` means, e.g. `win_rate`: its mean over episodes is logged so."""
+    agent_ids: tuple[str, ...] = ()
+    """Names of the agents, if they have any."""
+    obs_dims: tuple[int, ...] = ()
+    """Each agent's own number of observation features, where they differ; the rest is padding."""
+    action_dims: tuple[int, ...] = ()
+    """Each agent's own number of actions, where they differ; the rest is never available."""
 
 
 class CompiledEnv(Protocol):

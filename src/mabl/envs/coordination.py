@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from mabl.envs.base import Discrete, EnvSpec
-from mabl.types import PRNGKey, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import PRNGKey
 
 N_CUES = 3
 STEPS = 4

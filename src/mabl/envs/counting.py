@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from mabl.envs.base import Discrete, EnvSpec
-from mabl.types import PRNGKey, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import PRNGKey
 
 
 class CountingState(NamedTuple):

@@ -21,7 +21,8 @@ from jaxtyping import Array, Float, Int
 from mabl.envs.base import Discrete, EnvSpec
 from mabl.envs.smax_terrain import STOP, TerrainSMAX, Wall, attack_closest
 from mabl.errors import unknown_name
-from mabl.types import PRNGKey, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import PRNGKey
 
 OUT_OF_REACH = 2**30
 """Inner step limit; SMAX's own is off by one and sets the same flag as a battle's end."""

@@ -10,7 +10,9 @@ from jaxtyping import Array, Int
 from mabl import replay as replays
 from mabl.algorithms.base import Algorithm, Experience
 from mabl.envs.base import CompiledEnv
+from mabl.envs.host import Hosted
 from mabl.execution import Executor, executor_of
+from mabl.host_rollout import start_hosted
 from mabl.replay import Replay
 from mabl.rollout import Collector, Rollout, rollout, start
 from mabl.types import Metrics, PRNGKey
@@ -27,10 +29,24 @@ class TrainState(NamedTuple):
     model_updates: Int[Array, ""]
 
 
+class CycleKeys(NamedTuple):
+    """Randomness of a cycle, and of all after it."""
+
+    after: PRNGKey
+    collect: PRNGKey
+    model: PRNGKey
+    policy: PRNGKey
+
+
+def cycle_keys(key: PRNGKey) -> CycleKeys:
+    """Split the key of a state."""
+    return CycleKeys(*jax.random.split(key, 4))
+
+
 class Training(NamedTuple):
     """An algorithm in an environment, ready to run."""
 
-    env: CompiledEnv
+    env: CompiledEnv | Hosted
     algorithm: Algorithm
 
     def init(self, key: PRNGKey) -> TrainState:
@@ -38,10 +54,14 @@ class Training(NamedTuple):
         config = self.algorithm.config.training
         key, key_learner, key_envs = jax.random.split(key, 3)
         learner = self.algorithm.init(key_learner)
-        executor = self._executor(learner)
-        collectors = jax.vmap(lambda key: start(self.env, executor, key))(
-            jax.random.split(key_envs, config.num_envs)
-        )
+        executor = self.executor(learner)
+
+        def begin(key: PRNGKey) -> Collector:
+            if isinstance(self.env, Hosted):
+                return start_hosted(self.env.spec, executor, key)
+            return start(self.env, executor, key)
+
+        collectors = jax.vmap(begin)(jax.random.split(key_envs, config.num_envs))
         capacity = config.replay_capacity // config.num_envs
         replay = jax.vmap(lambda row: replays.empty(row, capacity))(collectors.row)
         return TrainState(learner, replay, collectors, key, jnp.int32(0), jnp.int32(0))
@@ -49,14 +69,29 @@ class Training(NamedTuple):
     def cycle(
         self, state: TrainState, n_model: Int[Array, ""], n_policy: Int[Array, ""]
     ) -> tuple[TrainState, Metrics]:
-        """Lines 3-14: collect, store, `n_model` model updates, `n_policy` policy updates.
+        """Lines 3-14: collect, then `learn`, where environments are compiled too."""
+        key = cycle_keys(state.key).collect
+        collectors, collected = self.collect(state.learner, state.collectors, key)
+        return self.learn(state, collectors, collected, n_model, n_policy)
+
+    def learn(
+        self,
+        state: TrainState,
+        collectors: Collector,
+        collected: Rollout,
+        n_model: Int[Array, ""],
+        n_policy: Int[Array, ""],
+    ) -> tuple[TrainState, Metrics]:
+        """Lines 4-14: store what was collected, `n_model` model updates, `n_policy` policy updates.
 
         Metrics are means over the cycle's updates (NaN if there were none) and sums over the
         episodes that ended in it.
         """
-        key, key_collect, key_model, key_policy = jax.random.split(state.key, 4)
-        collectors, collected = self.collect(state.learner, state.collectors, key_collect)
-        replay = self.store(state.replay, collected)
+        key, _, key_model, key_policy = cycle_keys(state.key)
+        replay = state.replay
+        if isinstance(self.env, Hosted):
+            replay = jax.vmap(replays.cut)(replay, state.collectors.row.truncated)
+        replay = self.store(replay, collected)
         experience = Experience(replay, state.collectors, collected)
         learner, model_metrics = repeat(
             lambda learner, key: self.algorithm.update_model(learner, experience, key),
@@ -88,16 +123,23 @@ class Training(NamedTuple):
         Rewards are scaled as learning wants them, sums over episodes are not.
         """
         config = self.algorithm.config.training
-        executor = self._executor(learner)
-        one_episode = config.collect_steps is None
-        n_rows = config.collect_steps or self.env.spec.episode_limit + 1
+        assert not isinstance(self.env, Hosted)
+        env, executor = self.env, self.executor(learner)
+        n_rows, one_episode = self.rows_wanted
         collectors, collected = jax.vmap(
-            lambda collector, key: rollout(self.env, executor, collector, key, n_rows, one_episode)
+            lambda collector, key: rollout(env, executor, collector, key, n_rows, one_episode)
         )(collectors, jax.random.split(key, config.num_envs))
         rows = collected.rows._replace(reward=collected.rows.reward * config.reward_scale)
         return collectors, collected._replace(rows=rows)
 
-    def _executor(self, learner: Any) -> Executor:
+    @property
+    def rows_wanted(self) -> tuple[int, bool]:
+        """Rows of an environment in a cycle, at most; and whether its episode's end ends them."""
+        steps = self.algorithm.config.training.collect_steps
+        return steps or self.env.spec.episode_limit + 1, steps is None
+
+    def executor(self, learner: Any) -> Executor:
+        """How the learner acts while it learns."""
         return executor_of(self.algorithm.policy(learner), self.env.spec.action_space)
 
     def store(self, replay: Replay, collected: Rollout) -> Replay:

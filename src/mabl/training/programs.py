@@ -1,6 +1,7 @@
 """A run's compiled programs, traced once for all runs of a process that compute the same."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -10,6 +11,8 @@ import jax
 from mabl.algorithms import registry as algorithms
 from mabl.algorithms.config import Config
 from mabl.envs import registry as envs
+from mabl.envs.host import Hosted
+from mabl.training.hosting import Cycle, hosted_cycle
 from mabl.training.loop import Training, TrainState
 from mabl.types import Metrics
 
@@ -23,14 +26,21 @@ class Programs(NamedTuple):
     training: Training
     init: Any
     """First states from keys `[S]`."""
-    cycle: Callable[[TrainState, int, int], tuple[TrainState, Metrics]]
-    """`Training.cycle`; it consumes the states that it is given."""
+    open_cycle: Callable[[Config], AbstractContextManager[Cycle]]
+    """Goes on from states, with the workers of the run's own config if there are any."""
     diagnose: Callable[[TrainState], Metrics]
+
+
+_UNCOMPILED = (
+    *("preset", "seed", "total_steps", "logdir"),
+    *("num_workers", "worker_timeout"),
+)
+"""Fields of a config that no program depends on."""
 
 
 def build(config: Config) -> Training:
     """The algorithm of a config in its environment."""
-    env = envs.make(config.env)
+    env = envs.make(config.env, config.env_kwargs)
     return Training(env, algorithms.make(config, env.spec))
 
 
@@ -40,8 +50,8 @@ def programs(config: Config) -> Programs:
     No program may depend on these: in `training.algorithm.config` they are not the run's.
     """
     plain = Config()
-    unread = {name: getattr(plain, name) for name in algorithms.unread(config.algo)}
-    same = replace(config, preset="quick", seed=0, total_steps=1, logdir="", **unread)
+    names = (*_UNCOMPILED, *algorithms.unread(config.algo))
+    same = replace(config, **{name: getattr(plain, name) for name in names})
     return _programs(same, algorithms.entry(config.algo), envs.family(config.env))
 
 
@@ -58,26 +68,36 @@ def _programs(config: Config, *registered: Any) -> Programs:
     return Programs(
         training,
         init=jax.jit(jax.vmap(training.init)),
-        cycle=_over_seeds(training.cycle, config.num_seeds, donate=True),
+        open_cycle=_open_cycle(training, config.num_seeds),
         diagnose=_over_seeds(diagnose, config.num_seeds),
     )
+
+
+def _open_cycle(training: Training, n_seeds: int) -> Callable[[Config], Any]:
+    if isinstance(training.env, Hosted):
+        learn = _over_seeds(training.learn, n_seeds, n_states=3, donate=True)
+        return hosted_cycle(training, learn, n_seeds)
+    cycle = _over_seeds(training.cycle, n_seeds, donate=True)
+    return lambda config: nullcontext(cycle)
 
 
 forget_programs = _programs.cache_clear
 """Lets go of them."""
 
 
-def _over_seeds(function: Any, n_seeds: int, donate: bool = False) -> Any:
+def _over_seeds(function: Any, n_seeds: int, n_states: int = 1, donate: bool = False) -> Any:
     """Compile a function of one seed's state for all seeds; a single seed is spared the vmap.
 
-    The batched trip counts stay scalars, so that loops are not masked.
+    All but the first `n_states` arguments are trip counts. They stay scalars, so that loops are not
+    masked. The first argument may be donated.
     """
 
-    def mapped(states: TrainState, *counts: Any) -> Any:
+    def mapped(*arguments: Any) -> Any:
+        states, counts = arguments[:n_states], arguments[n_states:]
         if n_seeds > 1:
-            axes = (0, *[None] * len(counts))
-            return jax.vmap(function, in_axes=axes)(states, *counts)
+            axes = (*[0] * n_states, *[None] * len(counts))
+            return jax.vmap(function, in_axes=axes)(*arguments)
         one = jax.tree.map(lambda x: x[0], states)
-        return jax.tree.map(lambda x: x[None], function(one, *counts))
+        return jax.tree.map(lambda x: x[None], function(*one, *counts))
 
     return jax.jit(mapped, donate_argnums=0 if donate else ())

@@ -107,6 +107,7 @@ def _run(
     saved, drawn, began = step, time.monotonic(), time.monotonic()
     console.print("compiling (cached for the next run) ...", highlight=False)
     with (
+        run.open_cycle(config) as cycle,
         _Interruption(console) as interruption,
         Progress(console, total_steps, training.env.spec.score_name) as progress,
     ):
@@ -115,7 +116,7 @@ def _run(
             n_model, n_policy = updates_due(states, training)
             if n_model and int(states.model_updates[0]) < config.training.pretrain_updates:
                 console.print(f"pretraining the model: {n_model} updates ...", highlight=False)
-            states, metrics = run.cycle(states, n_model, n_policy)
+            states, metrics = cycle(states, n_model, n_policy)
             step = int(states.env_steps.min())
             if longest_lane(states) >= DIAGNOSED_ROWS and crossed(
                 before, step, config.training.diagnose_every

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from mabl.envs.base import ActionSpace, Discrete
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.kl import balanced_kl, categorical_kl
-from mabl.types import Metrics, PRNGKey, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import Metrics, PRNGKey
 from mabl.world_models.heads import Predictions
 
 L = TypeVar("L")

@@ -8,7 +8,8 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import EnvSpec
 from mabl.nets.mlp import MLP
-from mabl.types import PRNGKey, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads
 from mabl.world_models.levels import AgentFilter, Categoricals, Level, Recurrent

@@ -17,7 +17,8 @@ from mabl.envs.base import EnvSpec
 from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.attention import TransformerEncoder
 from mabl.nets.mlp import MLP, Linear
-from mabl.types import PRNGKey, TimeStep
+from mabl.rows import TimeStep
+from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads, Predictions
 from mabl.world_models.levels import Categoricals, Level, draw, forget

@@ -1,0 +1,127 @@
+"""Environments that run in Python, beside jax. Their worker processes import this, and no jax."""
+
+import importlib
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from mabl.envs.base import EnvSpec
+from mabl.errors import UserError
+from mabl.rows import TimeStep
+
+
+class HostEnv(Protocol):
+    """One simulator. It never resets itself; its rows hold numpy arrays.
+
+    It may draw itself: `render() -> uint8 [height, width, 3]`.
+    """
+
+    spec: EnvSpec
+
+    def reset(self, seed: int) -> TimeStep:
+        """Start an episode that `seed` decides; the row has `is_first` set."""
+        ...
+
+    def step(self, action: np.ndarray) -> TimeStep:
+        """Take one joint step `[N, ...]`. Undefined after a row for which `is_last` holds."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the simulator."""
+        ...
+
+
+@dataclass(frozen=True)
+class Hosted:
+    """An environment of workers: its sizes and names, and how a worker makes one."""
+
+    spec: EnvSpec
+    make: Callable[[], HostEnv]
+    """It travels to other processes: a class, a function of a module, or a `partial` of such."""
+
+
+def hosted_of(make: Callable[[], HostEnv]) -> Hosted:
+    """Make one to learn its sizes and names."""
+    env = make()
+    try:
+        return Hosted(env.spec, make)
+    finally:
+        env.close()
+
+
+def load_factory(name: str, target: str, default: str) -> Callable[..., Any]:
+    """What is at `module:attribute`; modules in the current folder are found, too.
+
+    Raises UserError for what cannot be imported.
+    """
+    module, _, attribute = target.partition(":")
+    attribute = attribute or default
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    try:
+        found: Any = importlib.import_module(module)
+        for part in attribute.split("."):
+            found = getattr(found, part)
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"{name}: no module named {error.name!r}: install it, or run mabl where it lies"
+        ) from error
+    except AttributeError as error:
+        raise UserError(
+            f"{name}: module {module!r} has no {attribute!r}: give module:factory"
+        ) from error
+    return found
+
+
+def made(name: str, factory: Callable[..., Any], kwargs: Mapping[str, Any]) -> Any:
+    """What a factory makes. Raises UserError for arguments that it does not take."""
+    try:
+        return factory(**kwargs)
+    except TypeError as error:
+        if not kwargs:
+            raise
+        given = " ".join(f"{key}={value}" for key, value in kwargs.items())
+        raise UserError(f"{name} cannot be made with {given}: {error}") from error
+
+
+def empty_rows(spec: EnvSpec, *leading: int) -> TimeStep:
+    """Rows of zeros `[*leading, ...]`, to be written."""
+
+    def zeros(dtype: Any, *shape: int) -> Any:
+        return np.zeros((*leading, *shape), dtype)
+
+    n, space = spec.n_agents, spec.action_space
+    return TimeStep(
+        prev_action=zeros(space.dtype, n, *space.shape),
+        reward=zeros(np.float32, n),
+        terminated=zeros(bool, n),
+        truncated=zeros(bool),
+        obs=zeros(np.float32, n, spec.obs_dim),
+        state=zeros(np.float32, spec.state_dim),
+        available=zeros(bool, n, space.size),
+        alive=zeros(bool, n),
+        is_first=zeros(bool),
+        score=zeros(np.float32),
+    )
+
+
+def write_row(rows: TimeStep, index: Any, row: TimeStep, spec: EnvSpec) -> None:
+    """Put `row` where `rows[index]` is.
+
+    Raises UserError for a field of another shape, and for observations, states and rewards that
+    are not finite.
+    """
+    for name, slots, value in zip(TimeStep._fields, rows, row, strict=True):
+        slot, value = slots[index], np.asarray(value)
+        if value.shape != slot.shape:
+            raise UserError(
+                f"{spec.name} gave {name} of shape {value.shape}, its spec says {slot.shape}"
+            )
+        if name in ("obs", "state", "reward") and not np.isfinite(value).all():
+            where = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
+            raise UserError(f"{spec.name} gave {name}{list(where)} = {value[where]}")
+        slots[index] = value
