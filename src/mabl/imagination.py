@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mabl.behaviour.base import ActorFunction
-from mabl.envs.base import ActionSpace
+from mabl.envs.base import ActionSpace, Discrete
 from mabl.errors import require_between, require_positive
 from mabl.types import PRNGKey, TeamView, Trajectory
 from mabl.world_models.base import WorldModel
@@ -70,12 +70,14 @@ class Dream(NamedTuple):
         key_latent, key_available = jax.random.split(key)
         latent = self.model.imagine(state.latent, self.action_space.encode(action), key_latent)
         predicted = self.model.predict(latent)
-        threshold = (
-            jax.random.uniform(key_available, state.available.shape)
-            if self.config.sample_availability
-            else 0.5
-        )
-        available = jax.nn.sigmoid(predicted.available) > threshold
+        available = state.available  # dimensions of continuous actions come and go for nobody
+        if isinstance(self.action_space, Discrete):
+            threshold = (
+                jax.random.uniform(key_available, available.shape)
+                if self.config.sample_availability
+                else 0.5
+            )
+            available = jax.nn.sigmoid(predicted.available) > threshold
         return Imagined(latent, available, state.alive & (predicted.alive > 0)), predicted
 
     def view(self, state: Imagined) -> TeamView:

@@ -133,6 +133,26 @@ def test_seeds_of_one_program_keep_their_shapes(algo):
 
 
 @EVERY
+def test_continuous_actions_of_different_sizes_go_through_or_are_refused(algo):
+    """Agent 0 has one dimension and agent 1 has two; `test_learns.py` learns with them."""
+    config = tiny(algo, "test/aiming")
+    if ALGORITHMS[algo].discrete:
+        with pytest.raises(UserError, match=f"test/aiming has continuous actions, {algo} needs"):
+            build(config)
+        return
+    training = build(config)
+    state = jax.jit(training.init)(jax.random.key(0))
+    collect = jax.jit(training.collect)
+    rows = collect(state.learner, state.collectors, jax.random.key(1))[1].rows
+    actions = rows.prev_action[~rows.is_first]
+    assert not actions[:, 0, 1].any() and actions[:, 1].all()
+    assert np.abs(actions).max() <= 1
+    after, _ = jax.eval_shape(training.cycle, state, 1, 1)
+    kind = lambda x: (x.shape, x.dtype)  # noqa: E731
+    assert jax.tree.map(kind, after) == jax.tree.map(kind, state)
+
+
+@EVERY
 @pytest.mark.parametrize("name", ["quick", "paper"])
 @pytest.mark.parametrize("env", ["smax/3m", "smax/2s3z", "test/coordination"])
 def test_every_preset_builds_it(algo, name, env):

@@ -15,6 +15,7 @@ from mabl.algorithms.presets import preset
 from mabl.behaviour import mappo
 from mabl.behaviour.actor import MaskedCategorical
 from mabl.behaviour.mappo import MAPPO, ActorCritic, MAPPOConfig
+from mabl.envs.base import Discrete
 from mabl.envs.coordination import CoordinationEnv
 from mabl.imagination import imagine_trajectory
 from mabl.replay import sample_sequences
@@ -37,7 +38,7 @@ def same(a, b) -> bool:
 
 @pytest.fixture(scope="module")
 def fresh() -> ActorCritic:
-    return MAPPO(TINY).init(some_view(2), n_actions=4, key=jax.random.key(1))
+    return MAPPO(TINY).init(some_view(2), Discrete(4), key=jax.random.key(1))
 
 
 def some_view(*shape: int) -> TeamView:

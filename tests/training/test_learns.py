@@ -8,7 +8,7 @@ from mabl.algorithms.presets import preset
 from mabl.algorithms.registry import ALGORITHMS
 from mabl.envs.coordination import CoordinationEnv
 from mabl.evaluation import evaluate
-from mabl.execution import RandomExecutor
+from mabl.execution import RandomExecutor, executor_of
 from mabl.training.programs import build
 from mabl.training.run import updates_due
 
@@ -22,12 +22,8 @@ def compile_well():
     jax.config.update("jax_disable_most_optimizations", True)
 
 
-@pytest.mark.parametrize(
-    "algo",
-    [pytest.param(name, marks=pytest.mark.xdist_group(f"learns-{name}")) for name in ALGORITHMS],
-)
-def test_it_learns_to_remember_and_to_coordinate(algo, compile_well):
-    config = preset("quick", "test/coordination", algo)
+def learned(config, compile_well):
+    """After a run: algorithm, learner, and by cycle sums of scores and numbers of episodes."""
     training = build(config)
     state = jax.jit(training.init)(jax.random.key(0))
     compile_well()
@@ -38,11 +34,34 @@ def test_it_learns_to_remember_and_to_coordinate(algo, compile_well):
         state, metrics = cycle(state, *due)
         scores.append(float(metrics["episodes/score"]))
         counts.append(int(metrics["episodes/count"]))
+    return training, state.learner, scores, counts
+
+
+def alone(algo: str):
+    """A test of an algorithm on a worker of its own."""
+    return pytest.param(algo, marks=pytest.mark.xdist_group(f"learns-{algo}"))
+
+
+@pytest.mark.parametrize("algo", map(alone, ALGORITHMS))
+def test_it_learns_to_remember_and_to_coordinate(algo, compile_well):
+    _, _, scores, counts = learned(preset("quick", "test/coordination", algo), compile_well)
     seen = np.cumsum(counts)
     first, last = seen <= FIRST_EPISODES, seen > seen[-1] - LAST_EPISODES
     mean = lambda chosen: np.sum(scores, where=chosen) / np.sum(counts, where=chosen)  # noqa: E731
     assert mean(last) >= 0.8
     assert mean(first) < 0.3  # it was learned, not given
+
+
+@pytest.mark.parametrize("algo", map(alone, ["mabl", "mappo"]))
+def test_it_learns_with_continuous_actions(algo, compile_well):
+    training, learner, *_ = learned(preset("quick", "test/aiming", algo), compile_well)
+    space = training.env.spec.action_space
+    trained = executor_of(training.algorithm.policy(learner), space, greedy=True)
+    played = [
+        np.mean(evaluate(training.env, executor, jax.random.key(0), 128).score)
+        for executor in (trained, RandomExecutor(space))
+    ]
+    assert played[0] >= 0.7 and played[1] < 0.4  # doing nothing: .4
 
 
 def test_a_random_policy_does_not_solve_it():

@@ -53,7 +53,7 @@ class ModelBased(NamedTuple):
         model = self.world_model(self.spec, self.config.world_model, key_model)
         shape = (self.spec.n_agents, self.spec.action_space.size)
         view = self._view(model, model.initial(), jnp.ones(shape, bool), jnp.ones(shape[0], bool))
-        behaviour = self.behaviour.init(view, shape[1], key_behaviour)
+        behaviour = self.behaviour.init(view, self.spec.action_space, key_behaviour)
         return Learner(model, self._optimiser().init(eqx.filter(model, eqx.is_array)), behaviour)
 
     def policy(self, learner: Learner) -> Policy:

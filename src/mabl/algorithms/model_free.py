@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
-from mabl.behaviour.actor import Actor
+from mabl.behaviour.actor import actor_for
 from mabl.behaviour.base import minibatches
 from mabl.behaviour.critic import Critic
 from mabl.behaviour.mappo import PPORows, real_returns, weighted_mean
@@ -84,12 +84,13 @@ class ModelFree:
         key_filter, key_actor, key_critic = jax.random.split(key, 3)
         policy = Policy(
             RecurrentFilter(spec.obs_dim, config.hidden, key_filter),
-            Actor(
+            actor_for(
+                spec.action_space,
                 config.hidden,
-                spec.action_space.size,
                 config.hidden,
                 0,
                 config.actor_out_scale,
+                config.initial_std,
                 key_actor,
             ),
         )

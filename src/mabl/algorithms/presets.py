@@ -20,6 +20,7 @@ PAPER = {
     "smac": _SMAC,
     "smacv2": _SMAC,
     "smax": replace(_SMAC, training=TrainingConfig(reward_scale=SMAX_REWARD_SCALE)),
+    "mamujoco": replace(_SMAC, total_steps=200_000),
     "pettingzoo": _SMAC,
     "test": Config(preset="paper", total_steps=10_000),
 }
@@ -102,22 +103,48 @@ _QUICK = {
 _QUICK_SMAC = replace(
     _QUICK["smax"], training=replace(_QUICK["smax"].training, reward_scale=1.0, num_envs=8)
 )
+# Nothing is known of its rewards.
+_QUICK_OWN = replace(_QUICK_SMAC, world_model=replace(_QUICK_SMAC.world_model, reward_weight=1.0))
 
 QUICK = _QUICK | {
     "smac": _QUICK_SMAC,
     "smacv2": _QUICK_SMAC,
-    # Nothing is known of its rewards.
-    "pettingzoo": replace(
-        _QUICK_SMAC, world_model=replace(_QUICK_SMAC.world_model, reward_weight=1.0)
+    "pettingzoo": _QUICK_OWN,
+    # Five a step for standing upright.
+    "mamujoco": replace(
+        _QUICK_OWN,
+        total_steps=100_000,
+        training=replace(_QUICK_OWN.training, reward_scale=0.1, num_envs=4, collect_steps=32),
+        mappo=replace(_QUICK_OWN.mappo, ent_coef=0.003),
     ),
 }
 
 PRESETS = {"quick": QUICK, "paper": PAPER}
 
+# Steps of table 1 where they are not 100,000, and the rates of table 4 where they are not 3e-4.
+_SMAC_MAPS: dict[str, dict[str, Any]] = {
+    "3s_vs_5z": {"total_steps": 200_000, "world_model": {"learning_rate": 5e-4}},
+    "corridor": {"total_steps": 450_000},
+    "3s5z_vs_3s6z": {"total_steps": 450_000},
+}
+_STANDUP = {
+    "total_steps": 800_000,
+    "world_model": {"learning_rate": 5e-6},
+    "mappo": {"actor_learning_rate": 3e-4, "critic_learning_rate": 5e-6},
+}
+
 BY_ENV: dict[tuple[str, str], dict[str, Any]] = {
-    # Table 4; every other SMAC map has the default 3e-4.
-    ("paper", "smac/3s_vs_5z"): {"world_model": {"learning_rate": 5e-4}},
-    ("paper", "smax/3s_vs_5z"): {"world_model": {"learning_rate": 5e-4}},
+    **{
+        ("paper", f"{family}/{name}"): changes
+        for family in ("smac", "smax")
+        for name, changes in _SMAC_MAPS.items()
+    },
+    ("paper", "mamujoco/Humanoid"): {
+        "world_model": {"learning_rate": 1e-5},
+        "mappo": {"actor_learning_rate": 3e-4, "critic_learning_rate": 1e-5},
+    },
+    ("paper", "mamujoco/HumanoidStandup"): _STANDUP,
+    ("paper", "mamujoco/HumanoidStandup-legs"): _STANDUP,
     # Wins come early and often.
     ("quick", "smax/3m"): {"world_model": {"reward_weight": 1.0}},
 }
@@ -187,7 +214,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
 """Fields that an algorithm changes, and fields of its sections, by (preset, family, algo)."""
 
 
-KIN = {"smac": "smax", "smacv2": "smax", "pettingzoo": "smax"}
+KIN: dict[str, str] = dict.fromkeys(("smac", "smacv2", "mamujoco", "pettingzoo"), "smax")
 """Families in which algorithms are changed like in another."""
 
 

@@ -39,6 +39,8 @@ class Entry:
     """An agent acts on its own observations alone."""
     shared: bool = True
     """Agents share the parameters of the model, or without one of the policy."""
+    discrete: bool = False
+    """It is for discrete actions alone."""
 
 
 class Column(NamedTuple):
@@ -68,6 +70,7 @@ ALGORITHMS = {
         lambda spec, config: ModelBased(MABL, QMIX(config.qmix), spec, config),
         "MABL's world model, QMIX in imagination",
         sections=("training", "world_model", "imagination", "qmix"),
+        discrete=True,
     ),
     "dreamer-v2": Entry(
         lambda spec, config: ModelBased(DreamerV2, MAPPO(config.mappo), spec, config),
@@ -126,7 +129,7 @@ def make(config: Config, spec: EnvSpec) -> Algorithm:
     too small for a sequence or for what a cycle collects.
     """
     chosen = entry(config.algo)
-    if not isinstance(spec.action_space, Discrete):
+    if chosen.discrete and not isinstance(spec.action_space, Discrete):
         raise UserError(f"{spec.name} has continuous actions, {config.algo} needs discrete ones")
     algorithm = chosen.build(spec, config)
     plan = config.training

@@ -5,8 +5,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import log_ndtr
+from jax.scipy.stats import norm
 from jaxtyping import Array, Bool, Float, Int
 
+from mabl.envs.base import ActionSpace, Continuous
 from mabl.nets.categorical import sample_index
 from mabl.nets.mlp import MLP
 from mabl.types import PRNGKey
@@ -41,9 +44,59 @@ class MaskedCategorical(NamedTuple):
         """In nats."""
         return -(jnp.exp(self.log_probs) * self.log_probs).sum(-1)
 
+    @staticmethod
+    def free(available: Bool[Array, "*b A"]) -> Bool[Array, "*b"]:
+        """Where there is a choice: more than one action, or none, which masks none."""
+        return available.sum(-1) != 1
+
+
+class CensoredNormal(NamedTuple):
+    """A policy over actions in [-1, 1]: normal, and what falls outside is done at the bound.
+
+    Bounds have the probability of all that lies beyond, so that the likelihood of an action that
+    was really taken is exact (ADR 12). Dimensions that an agent lacks are 0.
+    """
+
+    mean: Float[Array, "*b A"]
+    std: Float[Array, "*b A"]
+    exists: Bool[Array, "*b A"]
+
+    def sample(self, key: PRNGKey) -> Float[Array, "*b A"]:
+        """Draw an action."""
+        return self._bounded(self.mean + self.std * jax.random.normal(key, self.mean.shape))
+
+    def mode(self) -> Float[Array, "*b A"]:
+        """The mean, or the bound nearest to it."""
+        return self._bounded(self.mean)
+
+    def log_prob(self, action: Float[Array, "*b A"]) -> Float[Array, "*b"]:
+        """log pi(action): densities within the bounds, probabilities on them."""
+        inside = norm.logpdf(action, self.mean, self.std)
+        above = log_ndtr((self.mean - 1) / self.std)
+        below = log_ndtr((-1 - self.mean) / self.std)
+        each = jnp.where(action >= 1, above, jnp.where(action <= -1, below, inside))
+        return (each * self.exists).sum(-1)
+
+    def entropy(self) -> Float[Array, "*b"]:
+        """Of the normal distribution, before the bounds; in nats."""
+        each = jnp.log(self.std) + 0.5 * jnp.log(2 * jnp.pi * jnp.e)
+        return (each * self.exists).sum(-1)
+
+    @staticmethod
+    def free(available: Bool[Array, "*b A"]) -> Bool[Array, "*b"]:
+        """Where there is a choice: a dimension at least."""
+        return available.any(-1)
+
+    def _bounded(self, action: Float[Array, "*b A"]) -> Float[Array, "*b A"]:
+        return jnp.clip(action, -1, 1) * self.exists
+
+
+Choice = MaskedCategorical | CensoredNormal
+"""What a policy is at one agent's features."""
+
 
 class Actor(eqx.Module):
-    """Policy of one agent; parameters shared by all."""
+    """Policy of one agent over discrete actions; parameters shared by all."""
 
     mlp: MLP
 
@@ -63,3 +116,48 @@ class Actor(eqx.Module):
     ) -> MaskedCategorical:
         """The policy at one agent's features."""
         return MaskedCategorical.of(self.mlp(features), available)
+
+
+class ContinuousActor(eqx.Module):
+    """Policy of one agent over continuous actions; parameters shared by all.
+
+    The mean depends on what is seen, the standard deviation does not (decision 19).
+    """
+
+    mlp: MLP
+    log_std: Float[Array, " A"]
+
+    def __init__(
+        self,
+        n_features: int,
+        n_actions: int,
+        hidden: int,
+        n_hidden: int,
+        out_scale: float,
+        initial_std: float,
+        key: PRNGKey,
+    ):
+        self.mlp = MLP(n_features, n_actions, hidden, n_hidden, key, out_scale)
+        self.log_std = jnp.full(n_actions, jnp.log(initial_std))
+
+    def __call__(
+        self, features: Float[Array, " F"], available: Bool[Array, " A"]
+    ) -> CensoredNormal:
+        """The policy at one agent's features; `available` are the dimensions that it has."""
+        return CensoredNormal(self.mlp(features), jnp.exp(self.log_std), available)
+
+
+def actor_for(
+    space: ActionSpace,
+    n_features: int,
+    hidden: int,
+    n_hidden: int,
+    out_scale: float,
+    initial_std: float,
+    key: PRNGKey,
+) -> Actor | ContinuousActor:
+    """A fresh policy over a space of actions."""
+    sizes = n_features, space.size, hidden, n_hidden, out_scale
+    if isinstance(space, Continuous):
+        return ContinuousActor(*sizes, initial_std, key)
+    return Actor(*sizes, key)

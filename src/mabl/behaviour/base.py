@@ -7,12 +7,13 @@ import jax
 from einops import rearrange
 from jaxtyping import Array, Bool, Float, Int
 
-from mabl.behaviour.actor import MaskedCategorical
+from mabl.behaviour.actor import Choice
+from mabl.envs.base import ActionSpace
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 
 S = TypeVar("S")
 
-ActorFunction = Callable[[Float[Array, " F"], Bool[Array, " A"]], MaskedCategorical]
+ActorFunction = Callable[[Float[Array, " F"], Bool[Array, " A"]], Choice]
 """A policy: one agent's features and available actions to a choice; a pytree of its parameters."""
 
 
@@ -22,7 +23,7 @@ class Behaviour(Protocol[S]):
     It holds its configuration and the sizes of what it sees, nothing that changes.
     """
 
-    def init(self, view: TeamView, n_actions: int, key: PRNGKey) -> S:
+    def init(self, view: TeamView, space: ActionSpace, key: PRNGKey) -> S:
         """Fresh networks and optimisers for views shaped like `view` `[N, ...]`."""
         ...
 

@@ -12,9 +12,10 @@ import optax
 from einops import rearrange
 from jaxtyping import Array, Float
 
-from mabl.behaviour.actor import Actor, MaskedCategorical
-from mabl.behaviour.base import minibatches
+from mabl.behaviour.actor import Actor, Choice, ContinuousActor, actor_for
+from mabl.behaviour.base import ActorFunction, minibatches
 from mabl.behaviour.critic import Critic
+from mabl.envs.base import ActionSpace
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.ppo import clipped_surrogate
 from mabl.losses.returns import lambda_returns
@@ -36,6 +37,8 @@ class MAPPOConfig:
     """Heads of the critic's self-attention over agents."""
     actor_out_scale: float = 1.0
     """Scale of the actor's last layer at the start; 0.01 starts with a uniform policy."""
+    initial_std: float = 0.5
+    """Standard deviation of continuous actions, which lie in [-1, 1], at the start."""
     actor_learning_rate: float = 1e-4
     """Adam's learning rate for the actor."""
     critic_learning_rate: float = 1e-3
@@ -70,7 +73,9 @@ class MAPPOConfig:
 
     def __post_init__(self) -> None:
         require_positive(self, "hidden", "n_hidden", "n_heads", "n_epochs", "batch_size")
-        require_positive(self, "actor_learning_rate", "critic_learning_rate", "grad_clip", "clip")
+        require_positive(
+            self, "initial_std", "actor_learning_rate", "critic_learning_rate", "grad_clip", "clip"
+        )
         require_between(self, 0, 1, "gamma", "gae_lambda", "ent_decay")
         require_between(self, 0, inf, "actor_weight_decay", "ent_coef", "value_coef")
         require_between(self, 0, inf, "replay_value_coef")
@@ -90,7 +95,7 @@ The dead are heard too: their latents are no padding, and know of the team (ADR 
 class ActorCritic(NamedTuple):
     """Everything that learning to act changes."""
 
-    actor: Actor
+    actor: Actor | ContinuousActor
     critic: Critic
     actor_opt: optax.OptState
     critic_opt: optax.OptState
@@ -121,13 +126,19 @@ class MAPPO(NamedTuple):
 
     config: MAPPOConfig
 
-    def init(self, view: TeamView, n_actions: int, key: PRNGKey) -> ActorCritic:
+    def init(self, view: TeamView, space: ActionSpace, key: PRNGKey) -> ActorCritic:
         """Fresh networks for features of the view's sizes."""
         config = self.config
         key_actor, key_critic = jax.random.split(key)
         n_actor, n_critic = view.actor_features.shape[-1], view.critic_features.shape[-1]
-        actor = Actor(
-            n_actor, n_actions, config.hidden, config.n_hidden, config.actor_out_scale, key_actor
+        actor = actor_for(
+            space,
+            n_actor,
+            config.hidden,
+            config.n_hidden,
+            config.actor_out_scale,
+            config.initial_std,
+            key_actor,
         )
         critic = Critic(n_critic, config.hidden, config.n_hidden, config.n_heads, key_critic)
         actor_optimiser, critic_optimiser = optimisers(config)
@@ -139,7 +150,7 @@ class MAPPO(NamedTuple):
             ent_coef=jnp.float32(config.ent_coef),
         )
 
-    def actor(self, state: ActorCritic) -> Actor:
+    def actor(self, state: ActorCritic) -> Actor | ContinuousActor:
         """The policy."""
         return state.actor
 
@@ -257,7 +268,7 @@ def weighted_mean(values: Float[Array, "*b"], weight: Float[Array, "*b"]) -> Flo
 
 
 def actor_loss(
-    actor: Actor, rows: PPORows, ent_coef: Float[Array, ""], clip: float
+    actor: ActorFunction, rows: PPORows, ent_coef: Float[Array, ""], clip: float
 ) -> tuple[Float[Array, ""], Metrics]:
     """PPO's loss of the policy that an actor has at `rows`."""
     policy = jax.vmap(jax.vmap(actor))(rows.view.actor_features, rows.view.available)
@@ -265,13 +276,13 @@ def actor_loss(
 
 
 def policy_loss(
-    policy: MaskedCategorical, rows: PPORows, ent_coef: Float[Array, ""], clip: float
+    policy: Choice, rows: PPORows, ent_coef: Float[Array, ""], clip: float
 ) -> tuple[Float[Array, ""], Metrics]:
     """PPO's clipped surrogate minus the entropy bonus.
 
     Rows of the dead, and rows without a choice, do not count.
     """
-    weight = rows.weight * rows.view.alive * (rows.view.available.sum(-1) != 1)
+    weight = rows.weight * rows.view.alive * policy.free(rows.view.available)
     # What does not count may be no choice at all, whose ratio must not overflow.
     log_prob = jnp.where(weight > 0, policy.log_prob(rows.action), rows.log_prob)
     surrogate = clipped_surrogate(log_prob, rows.log_prob, rows.advantage, clip)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mabl.behaviour.actor import MaskedCategorical
 from mabl.behaviour.base import minibatches
+from mabl.envs.base import ActionSpace
 from mabl.errors import require_between, require_positive
 from mabl.losses.returns import lambda_returns
 from mabl.nets.mlp import MLP
@@ -150,13 +151,13 @@ class QMIX(NamedTuple):
 
     config: QMIXConfig
 
-    def init(self, view: TeamView, n_actions: int, key: PRNGKey) -> QState:
+    def init(self, view: TeamView, space: ActionSpace, key: PRNGKey) -> QState:
         """Fresh networks for features of the view's sizes."""
         config = self.config
         key_q, key_mixer = jax.random.split(key)
         n_agents, n_features = view.critic_features.shape
         values = Values(
-            MLP(view.actor_features.shape[-1], n_actions, config.hidden, config.n_hidden, key_q),
+            MLP(view.actor_features.shape[-1], space.size, config.hidden, config.n_hidden, key_q),
             Mixer(
                 n_agents,
                 n_agents * n_features,

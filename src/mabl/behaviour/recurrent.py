@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float
 
-from mabl.behaviour.actor import MaskedCategorical
+from mabl.behaviour.actor import Choice
 from mabl.behaviour.base import ActorFunction
 from mabl.behaviour.mappo import PPORows, policy_loss, weighted_mean
 from mabl.errors import UserError, require_between, require_positive
@@ -39,6 +39,8 @@ class RecurrentMAPPOConfig:
     """Heads of the critic's self-attention over agents."""
     actor_out_scale: float = 0.01
     """Scale of the policy's last layer at the start."""
+    initial_std: float = 0.5
+    """Standard deviation of continuous actions, which lie in [-1, 1], at the start."""
     learning_rate: float = 5e-4
     """Adam's learning rate for policy and critic."""
     grad_clip: float = 10.0
@@ -67,6 +69,7 @@ class RecurrentMAPPOConfig:
 
     def __post_init__(self) -> None:
         require_positive(self, "hidden", "n_heads", "learning_rate", "grad_clip", "clip")
+        require_positive(self, "initial_std")
         require_positive(self, "n_epochs", "n_minibatches", "chunk_length")
         require_between(self, 0, 1, "gamma", "gae_lambda", "value_decay")
         require_between(self, 0, inf, "actor_out_scale", "ent_coef", "value_coef")
@@ -149,7 +152,7 @@ class Chunks(NamedTuple):
     """`[M, L, N, ...]`; actor features are memories that the collecting policy had."""
 
 
-def policies(filter: RecurrentFilter, actor: ActorFunction, view: TeamView) -> MaskedCategorical:
+def policies(filter: RecurrentFilter, actor: ActorFunction, view: TeamView) -> Choice:
     """The policy at memories `[*b, T, N, D]` and availabilities of a view with two leading axes."""
     features = filter.features(view.actor_features)
     return jax.vmap(jax.vmap(jax.vmap(actor)))(features, view.available)

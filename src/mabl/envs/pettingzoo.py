@@ -23,22 +23,32 @@ LIMITS = ("episode_limit", "max_cycles", "max_episode_steps", "max_steps")
 
 
 def make(
-    name: str, target: str, kwargs: Mapping[str, Any], episode_limit: int | None = None
+    name: str,
+    target: str,
+    kwargs: Mapping[str, Any],
+    episode_limit: int | None = None,
+    symlog: bool = False,
 ) -> Hosted:
     """`module:factory`, called with `kwargs`; without a factory, `parallel_env`.
 
-    Episodes are truncated after `episode_limit` joint steps, if not before. Raises UserError for
-    what cannot be imported, made, or learned in.
+    Episodes are truncated after `episode_limit` joint steps, if not before; `symlog` squashes
+    observations and states. Raises UserError for what cannot be imported, made, or learned in.
     """
-    return hosted_of(partial(ParallelEnv, name, target, dict(kwargs), episode_limit))
+    return hosted_of(partial(ParallelEnv, name, target, dict(kwargs), episode_limit, symlog))
 
 
 class ParallelEnv:
     """Rows of a Parallel environment. Agents whose spaces differ are told which one they are."""
 
     def __init__(
-        self, name: str, target: str, kwargs: dict[str, Any], episode_limit: int | None = None
+        self,
+        name: str,
+        target: str,
+        kwargs: dict[str, Any],
+        episode_limit: int | None = None,
+        symlog: bool = False,
     ):
+        self._squash = squash if symlog else np.asarray
         self._env = env = made(name, load_factory(name, target, FACTORY), kwargs)
         if not hasattr(env, "possible_agents"):
             raise UserError(
@@ -110,7 +120,7 @@ class ParallelEnv:
         available = np.zeros((n, space.size), bool)
         for i, (agent, watcher) in enumerate(zip(self._agents, self._watchers, strict=True)):
             if alive[i] and agent in obs:
-                seen[i, : watcher.size] = watcher.flat(obs[agent])
+                seen[i, : watcher.size] = self._squash(watcher.flat(obs[agent]))
                 if self._identity is not None:
                     seen[i, self._width :] = self._identity[i]
             if alive[i] and not self._terminated[i]:
@@ -138,7 +148,7 @@ class ParallelEnv:
 
     def _state(self, seen: np.ndarray) -> np.ndarray:
         state = state_of(self._env) if self._has_state else None
-        return seen.ravel() if state is None else state
+        return seen.ravel() if state is None else self._squash(state)
 
 
 class Watcher:
@@ -205,6 +215,11 @@ def actor_of(name: str, agent: Any, space: Any) -> DiscreteActor | ContinuousAct
     if isinstance(space, spaces.Box):
         return ContinuousActor(space)
     raise UserError(f"{name}: {agent} acts in {space}: Discrete or Box is needed")
+
+
+def squash(x: np.ndarray) -> np.ndarray:
+    """symlog(x) = sign(x) log(1 + |x|): large numbers come near, small ones stay."""
+    return np.sign(x) * np.log1p(np.abs(x))
 
 
 def limit_of(env: Any) -> int | None:

@@ -67,6 +67,7 @@ def _smax() -> Mapping[str, Entry]:
 
 
 def _test() -> Mapping[str, Entry]:
+    from mabl.envs.aiming import AimingEnv
     from mabl.envs.coordination import CoordinationEnv
     from mabl.envs.counting import CountingEnv
     from mabl.envs.counting_host import HostCountingEnv
@@ -76,6 +77,7 @@ def _test() -> Mapping[str, Entry]:
         "test/counting": Entry(CountingEnv, "a toy whose rows can be predicted by hand"),
         "test/host-counting": Entry(lambda: counting_host, "the same in Python"),
         "test/coordination": Entry(CoordinationEnv, "a toy that pays for acting together"),
+        "test/aiming": Entry(AimingEnv, "a toy with continuous actions"),
     }
 
 
@@ -106,16 +108,32 @@ def _smac_like(name: str, target: str, episode_limit: int | None = None, **kwarg
     return smac.make(name, target, kwargs, episode_limit)
 
 
-def _pettingzoo(name: str, target: str, episode_limit: int | None = None, **kwargs: Any) -> Hosted:
+def _mamujoco() -> Mapping[str, Entry]:
+    from mabl.envs import mamujoco
+
+    return {
+        (name := f"mamujoco/{key}"): Entry(partial(mamujoco.make, name), robot.description)
+        for key, robot in mamujoco.ROBOTS.items()
+    }
+
+
+def _pettingzoo(
+    name: str,
+    target: str,
+    episode_limit: int | None = None,
+    symlog: bool = False,
+    **kwargs: Any,
+) -> Hosted:
     from mabl.envs import pettingzoo
 
-    return pettingzoo.make(name, target, kwargs, episode_limit)
+    return pettingzoo.make(name, target, kwargs, episode_limit, symlog)
 
 
 FAMILIES: dict[str, Callable[[], Mapping[str, Entry]]] = {
     "smax": _smax,
     "smac": _smac,
     "smacv2": _smacv2,
+    "mamujoco": _mamujoco,
     "test": _test,
 }
 """Family to its entries by full name."""
