@@ -20,6 +20,23 @@ PAPER = {
     "smac": _SMAC,
     "smacv2": _SMAC,
     "smax": replace(_SMAC, training=TrainingConfig(reward_scale=SMAX_REWARD_SCALE)),
+    # Their columns Flatland; critics and rewards as in appendix B.1 and decisions 7 to 9.
+    "flatland": Config(
+        preset="paper",
+        total_steps=100_000,
+        training=TrainingConfig(model_updates=40, prefill_steps=2_500, replay_capacity=500_000),
+        world_model=WorldModelConfig(
+            hidden=400, batch_size=32, batch_length=50, learning_rate=2e-4
+        ),
+        mappo=MAPPOConfig(
+            hidden=400,
+            actor_learning_rate=5e-4,
+            critic_learning_rate=5e-4,
+            normalise_advantage=False,
+            team_reward=False,
+            global_critic=True,
+        ),
+    ),
     "mamujoco": replace(_SMAC, total_steps=200_000),
     "pettingzoo": _SMAC,
     "test": Config(preset="paper", total_steps=10_000),
@@ -110,6 +127,11 @@ QUICK = _QUICK | {
     "smac": _QUICK_SMAC,
     "smacv2": _QUICK_SMAC,
     "pettingzoo": _QUICK_OWN,
+    "flatland": replace(
+        _QUICK_OWN,
+        total_steps=100_000,
+        mappo=replace(_QUICK_OWN.mappo, team_reward=False),
+    ),
     # Five a step for standing upright.
     "mamujoco": replace(
         _QUICK_OWN,
@@ -139,6 +161,7 @@ BY_ENV: dict[tuple[str, str], dict[str, Any]] = {
         for family in ("smac", "smax")
         for name, changes in _SMAC_MAPS.items()
     },
+    ("paper", "flatland/10_agents"): {"total_steps": 450_000},
     ("paper", "mamujoco/Humanoid"): {
         "world_model": {"learning_rate": 1e-5},
         "mappo": {"actor_learning_rate": 3e-4, "critic_learning_rate": 1e-5},
@@ -214,7 +237,9 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
 """Fields that an algorithm changes, and fields of its sections, by (preset, family, algo)."""
 
 
-KIN: dict[str, str] = dict.fromkeys(("smac", "smacv2", "mamujoco", "pettingzoo"), "smax")
+KIN: dict[str, str] = dict.fromkeys(
+    ("smac", "smacv2", "flatland", "mamujoco", "pettingzoo"), "smax"
+)
 """Families in which algorithms are changed like in another."""
 
 

@@ -70,6 +70,8 @@ class MAPPOConfig:
     """Give advantages zero mean and unit variance over the imagined rows of the living."""
     team_reward: bool = True
     """Average predicted rewards over agents (SMAC, MAMuJoCo)."""
+    global_critic: bool = False
+    """Show critics the global latent alone (Flatland, appendix B.1), where a model has one."""
 
     def __post_init__(self) -> None:
         require_positive(self, "hidden", "n_hidden", "n_heads", "n_epochs", "batch_size")
@@ -155,7 +157,9 @@ class MAPPO(NamedTuple):
         return state.actor
 
     def critic_features(self, model: Any, latent: Any) -> Float[Array, "N G"]:
-        """All that the model has for critics."""
+        """All that the model has for critics, or its global latents alone."""
+        if self.config.global_critic and hasattr(model, "global_features"):
+            return model.global_features(latent)
         return model.critic_features(latent)
 
     def value(self, state: ActorCritic, view: TeamView) -> Float[Array, " N"]:

@@ -108,6 +108,17 @@ def _smac_like(name: str, target: str, episode_limit: int | None = None, **kwarg
     return smac.make(name, target, kwargs, episode_limit)
 
 
+def _flatland() -> Mapping[str, Entry]:
+    from mabl.envs import flatland
+
+    return {
+        (name := f"flatland/{key}"): Entry(
+            partial(flatland.make, name), f"{task.n_agents} trains, {task.n_cities} cities"
+        )
+        for key, task in flatland.TASKS.items()
+    }
+
+
 def _mamujoco() -> Mapping[str, Entry]:
     from mabl.envs import mamujoco
 
@@ -133,6 +144,7 @@ FAMILIES: dict[str, Callable[[], Mapping[str, Entry]]] = {
     "smax": _smax,
     "smac": _smac,
     "smacv2": _smacv2,
+    "flatland": _flatland,
     "mamujoco": _mamujoco,
     "test": _test,
 }
