@@ -20,6 +20,7 @@ from mabl.envs.pool import open_pool
 from mabl.evaluation import evaluate
 from mabl.execution import RandomExecutor
 from mabl.host_rollout import HostRollouts, act_where, start_hosted
+from mabl.rows import is_last
 from mabl.training.programs import programs
 
 COUNTING = Hosted(HostCountingEnv.spec, HostCountingEnv)
@@ -206,3 +207,28 @@ def test_evaluation_plays_whole_episodes(episodes):
     played = evaluate(env, executor, jax.random.key(0), episodes, num_workers=0)
     assert len(played.score) == len(set(played.score)) == episodes
     assert_array_equal(played.length, np.where(played.score % 2 == 0, 5, 7))
+
+
+def test_a_reset_made_ahead_goes_down_with_its_worker():
+    """One worker holds an environment in mid-episode and one that has been reset already."""
+    with Traced(COUNTING, 2, 1, num_workers=1) as traced:
+        over = [True, True]
+        while over != [False, True]:
+            over = is_last(traced.collect().after.row).tolist()
+        (worker,) = traced.pool._workers
+
+        def act_and_kill(*seen):
+            worker.process.kill()
+            worker.process.join()
+            return act(*seen)
+
+        told = pytest.warns(UserWarning, match="worker process died")
+        with told:
+            landed = traced.rollouts.collect(act_and_kill, traced.collectors)
+        traced.landed.append(landed)
+        assert_array_equal(landed.rollout.count, [1, 1])
+        assert landed.rollout.rows.is_first.all()  # both began anew, the second a second time
+        assert_array_equal(
+            landed.after.env_state.count, np.add(landed.before.env_state.count, [1, 2])
+        )
+    check_alignment(*traced.lane(1))

@@ -21,8 +21,6 @@ PARALLEL = 64
 """Episodes played side by side where environments are compiled."""
 HOSTED_PARALLEL = 8
 """The same where they run in Python."""
-HOSTED_TIMEOUT = 60.0
-"""Seconds that a step may take there."""
 
 
 class Results(NamedTuple):
@@ -41,11 +39,12 @@ def evaluate(
     key: PRNGKey,
     episodes: int,
     num_workers: int | None = None,
+    worker_timeout: float = 60.0,
 ) -> Results:
     """Play `episodes` independent episodes to their ends; with workers if the environment needs."""
     if not isinstance(env, Hosted):
         return _play_compiled(env, executor, key, episodes)
-    pool = open_pool(env, min(episodes, HOSTED_PARALLEL), num_workers, HOSTED_TIMEOUT)
+    pool = open_pool(env, min(episodes, HOSTED_PARALLEL), num_workers, worker_timeout)
     try:
         return _play_hosted(pool, env.spec, executor, key, episodes)
     finally:

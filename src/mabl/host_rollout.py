@@ -98,7 +98,7 @@ class HostRollouts:
             memory, action = act(memory, flight.row, flight.count, go)
             slots.action[:] = action
             arrived = self._command(flight, go & ~ahead, over) & go
-            flight.take(slots.rows, arrived | (go & ahead), over)
+            flight.take(slots.rows, arrived | (go & ahead & self._running), over)
             ahead[:] = False
         self._begin_ahead(flight)
         return flight.land(memory)

@@ -45,7 +45,7 @@ def load_run(
     config = folder.read_config(path)
     checkpoints = Checkpoints(path / "checkpoints")
     trained_in = envs.make(config.env, config.env_kwargs)
-    played_in = envs.make(env, env_kwargs) if env else trained_in
+    played_in = envs.make(env or config.env, env_kwargs) if env or env_kwargs else trained_in
     check_fits(trained_in.spec, played_in.spec)
     algorithm = algorithms.make(config, trained_in.spec)
     shape = jax.eval_shape(lambda key: algorithm.policy(algorithm.init(key)), jax.random.key(0))

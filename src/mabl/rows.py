@@ -38,7 +38,8 @@ class TimeStep(NamedTuple):
     state: Float[Array, "*b S"]
     """s_t, the global state of section 3.1: known in training, never in execution."""
     available: Bool[Array, "*b N A"]
-    """Actions that may be taken at t; at least one is true for every agent, dead ones included."""
+    """Discrete actions that may be taken at t; at least one is true for every agent, dead ones
+    included. Of continuous actions, the dimensions that an agent has; none once it is out."""
     alive: Bool[Array, "*b N"]
     """False for agents that are out of the episode; a loss mask."""
     is_first: Bool[Array, "*b"]

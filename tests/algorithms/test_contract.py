@@ -148,7 +148,7 @@ def test_continuous_actions_of_different_sizes_go_through_or_are_refused(algo):
     assert not actions[:, 0, 1].any() and actions[:, 1].all()
     assert np.abs(actions).max() <= 1
     after, _ = jax.eval_shape(training.cycle, state, 1, 1)
-    kind = lambda x: (x.shape, x.dtype)  # noqa: E731
+    kind = lambda x: (x.shape, x.dtype, getattr(x, "weak_type", False))  # noqa: E731
     assert jax.tree.map(kind, after) == jax.tree.map(kind, state)
 
 

@@ -64,8 +64,8 @@ class Leaving:
 class Arms(Leaving):
     """Two arms of different length, with actions from 0 to 10."""
 
-    def __init__(self):
-        super().__init__(n=2, stay=2, masked=None)
+    def __init__(self, stay=2):
+        super().__init__(n=2, stay=stay, masked=None)
 
     def action_space(self, agent):
         return spaces.Box(np.array([0.0] * self._size(agent)), 10.0, dtype=np.float64)
@@ -105,3 +105,16 @@ class Odd(Leaving):
 
 def nothing():
     return object()
+
+
+class Lingering(Leaving):
+    """Its agents are truncated at step 5, and stay listed."""
+
+    def __init__(self):
+        super().__init__(stay=3)
+
+    def step(self, actions):
+        there = list(self.agents)
+        told = super().step(actions)
+        self.agents = there
+        return told

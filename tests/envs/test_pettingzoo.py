@@ -93,6 +93,23 @@ def test_a_limit_truncates_and_what_ended_before_stays_ended():
     assert spec.episode_limit == 1000  # it does not say
 
 
+def test_agents_that_are_truncated_and_stay_listed_are_truncated():
+    _, env = opened(f"{OWN}:Lingering")
+    env.reset(0)
+    assert [bool(env.step(np.full(3, (t + 1) % 3, np.int32)).truncated) for t in range(1, 6)] == [
+        *[False] * 4,
+        True,
+    ]
+
+
+def test_continuous_agents_that_are_gone_have_no_dimensions():
+    _, env = opened("pettingzoo:tests.envs.leaving:Arms", "stay=1")
+    env.reset(0)
+    row = env.step(np.zeros((2, 2), np.float32))
+    assert row.terminated[0] and row.alive[0] and not row.available[0].any()
+    assert_array_equal(row.available[1], [True, True])
+
+
 def test_a_limit_of_ones_own_comes_first_and_scores_of_infos_count():
     spec, env = opened(f"{OWN}:Leaving", "stay=2", "episode_limit=2", "score=0.25")
     assert spec.episode_limit == 2
@@ -118,8 +135,9 @@ def test_continuous_actions_fill_their_own_bounds():
 @pytest.mark.parametrize(
     ("name", "kwargs", "message"),
     [
-        ("pettingzoo:no.such.module", (), "no module named 'no'"),
-        (f"{OWN}:Missing", (), "has no 'Missing': give module:factory"),
+        ("pettingzoo:", (), "names no module: give module:factory"),
+        ("pettingzoo:no.such.module", (), "No module named 'no'"),
+        (f"{OWN}:Missing", (), "has no Missing: give module:factory"),
         (f"{OWN}:nothing", (), "made object, which has no possible_agents"),
         (f"{OWN}:Odd", ("which=sequence",), "walker_0 observes .*, which has no fixed size"),
         (f"{OWN}:Odd", ("which=several",), r"walker_0 acts in MultiDiscrete\(.*Discrete or Box"),

@@ -56,7 +56,8 @@ def test_everyone_does_what_it_is_told(pool_of, num_workers):
 
 def test_workers_do_without_jax(pool_of):
     pool = pool_of(hosted("tells of jax"), 1, 1)
-    tell(pool, RESET)
+    pool.slots.rows.score[:] = 7
+    assert tell(pool, RESET) == []
     assert pool.slots.rows.score == 0
 
 

@@ -141,7 +141,8 @@ def test_what_is_missing_is_said_in_two_lines(name, package, monkeypatch):
     assert first.startswith(f"{name} needs {package}: pip install git+") and "SC2PATH" in second
 
 
-def test_official_environments_are_made_as_published(monkeypatch):
+def test_official_environments_are_made_as_published(monkeypatch, tmp_path):
+    monkeypatch.setenv("SC2PATH", str(tmp_path))
     asked = {}
 
     def record(name, target, options):

@@ -50,7 +50,7 @@ def test_a_run_folder_gives_back_the_programs(algo, tmp_path):
     assert programs(read_config(tmp_path)) is programs(config)
 
 
-@pytest.mark.parametrize("env", ["test/counting", "smax/3m"])
+@pytest.mark.parametrize("env", ["test/counting", "test/aiming", "smax/3m"])
 def test_first_states_have_no_weak_types(env):
     """No checkpoint keeps them, so a resumed run would be traced anew."""
     training = programs(preset("quick", env, "mappo")).training

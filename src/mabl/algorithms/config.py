@@ -98,7 +98,7 @@ class Config:
     num_workers: int | None = None
     """Processes for environments that run in Python; 0: the learner's own; None: one a core."""
     worker_timeout: float = 60.0
-    """Seconds that they may take for a step before they are replaced."""
+    """Seconds that they may take for a step or a reset before they are replaced."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
     communication: CommunicationConfig = field(default_factory=CommunicationConfig)

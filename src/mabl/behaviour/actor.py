@@ -1,5 +1,6 @@
 """The shared actor: pi(a | z_agent, h_agent), and nothing else of the world (section 3.3)."""
 
+from math import log
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,9 @@ from mabl.envs.base import ActionSpace, Continuous
 from mabl.nets.categorical import sample_index
 from mabl.nets.mlp import MLP
 from mabl.types import PRNGKey
+
+LEAST_LOG_STD = -5.0
+"""Below it, likelihoods at the bounds are lost in float32."""
 
 
 class MaskedCategorical(NamedTuple):
@@ -138,13 +142,14 @@ class ContinuousActor(eqx.Module):
         key: PRNGKey,
     ):
         self.mlp = MLP(n_features, n_actions, hidden, n_hidden, key, out_scale)
-        self.log_std = jnp.full(n_actions, jnp.log(initial_std))
+        self.log_std = jnp.full(n_actions, log(initial_std), jnp.float32)
 
     def __call__(
         self, features: Float[Array, " F"], available: Bool[Array, " A"]
     ) -> CensoredNormal:
         """The policy at one agent's features; `available` are the dimensions that it has."""
-        return CensoredNormal(self.mlp(features), jnp.exp(self.log_std), available)
+        std = jnp.exp(jnp.maximum(self.log_std, LEAST_LOG_STD))
+        return CensoredNormal(self.mlp(features), std, available)
 
 
 def actor_for(

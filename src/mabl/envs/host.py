@@ -60,20 +60,20 @@ def load_factory(name: str, target: str, default: str) -> Callable[..., Any]:
     """
     module, _, attribute = target.partition(":")
     attribute = attribute or default
+    if not module:
+        raise UserError(f"{name} names no module: give module:factory")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:
         found: Any = importlib.import_module(module)
-        for part in attribute.split("."):
-            found = getattr(found, part)
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         raise UserError(
-            f"{name}: no module named {error.name!r}: install it, or run mabl where it lies"
+            f"{name} cannot be imported ({error}): install it, or run mabl where it lies"
         ) from error
-    except AttributeError as error:
-        raise UserError(
-            f"{name}: module {module!r} has no {attribute!r}: give module:factory"
-        ) from error
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            raise UserError(f"{name}: {module} has no {attribute}: give module:factory")
+        found = getattr(found, part)
     return found
 
 

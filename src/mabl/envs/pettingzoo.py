@@ -87,9 +87,10 @@ class ParallelEnv:
         """Start an episode."""
         obs, infos = self._env.reset(seed=seed)
         space, n = self.spec.action_space, self.spec.n_agents
-        self._t, self._return = 0, 0.0
+        self._t, self._return, self._cut = 0, 0.0, False
         self._terminated = np.zeros(n, bool)
-        return self._row(np.zeros((n, *space.shape), space.dtype), obs, infos, {}, [True] * n)
+        there = [agent in self._env.agents for agent in self._agents]
+        return self._row(np.zeros((n, *space.shape), space.dtype), obs, infos, {}, there)
 
     def step(self, action: np.ndarray) -> TimeStep:
         """Take one joint step with the actions of those that are there."""
@@ -99,8 +100,9 @@ class ParallelEnv:
             for i, (agent, actor) in enumerate(zip(self._agents, self._actors, strict=True))
             if agent in live
         }
-        obs, rewards, terminations, _, infos = self._env.step(chosen)
+        obs, rewards, terminations, truncations, infos = self._env.step(chosen)
         self._t += 1
+        self._cut = not self._env.agents or all(truncations.get(a, False) for a in self._env.agents)
         self._terminated |= [bool(terminations.get(agent, False)) for agent in self._agents]
         return self._row(action, obs, infos, rewards, [agent in live for agent in self._agents])
 
@@ -128,11 +130,12 @@ class ParallelEnv:
                 available[i] = self._mask[i]
                 if mask is not None and mask.any():
                     available[i, : len(mask)] = mask
-        available[~available.any(-1), 0] = True  # those that are gone
+        if isinstance(space, Discrete):
+            available[~available.any(-1), 0] = True  # those that are gone
         reward = np.array([float(rewards.get(agent, 0.0)) for agent in self._agents], np.float32)
         self._return += float(reward.mean())
         ended = self._terminated.all()
-        truncated = not ended and (not self._env.agents or self._t >= self.spec.episode_limit)
+        truncated = not ended and (self._cut or self._t >= self.spec.episode_limit)
         return TimeStep(
             prev_action=action,
             reward=reward,
@@ -203,7 +206,8 @@ class ContinuousActor:
     def __call__(self, action: np.ndarray) -> np.ndarray:
         """From [-1, 1] to the environment's bounds."""
         unit = (np.clip(action[: self.size], -1, 1).reshape(self._space.shape) + 1) / 2
-        return (self._low + unit * (self._high - self._low)).astype(self._space.dtype)
+        stretched = self._low + unit * (self._high - self._low)
+        return np.clip(stretched.astype(self._space.dtype), self._space.low, self._space.high)
 
 
 def actor_of(name: str, agent: Any, space: Any) -> DiscreteActor | ContinuousActor:

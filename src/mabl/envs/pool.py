@@ -25,6 +25,9 @@ IDLE, STEP, RESET = range(3)
 ATTEMPTS = 3
 """Times that a worker may be lost in a row, no episode finished between."""
 
+CLOSE_TIMEOUT = 5.0
+"""Seconds that workers may take to close their environments."""
+
 START_TIMEOUT = 120.0
 """Seconds that a worker may take to import and make its environments."""
 
@@ -70,10 +73,16 @@ class Pool(Protocol):
 def open_pool(hosted: Hosted, num_envs: int, num_workers: int | None, timeout: float) -> Pool:
     """`num_envs` environments; 0 workers: in this process; None: as many as there are cores."""
     if num_workers is None:
-        num_workers = len(os.sched_getaffinity(0))
+        num_workers = n_cores()
     if num_workers == 0:
         return LocalPool(hosted, num_envs)
     return ProcessPool(hosted, num_envs, min(num_workers, num_envs), timeout)
+
+
+def n_cores() -> int:
+    """Cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # which not every system has
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def empty_slots(spec: EnvSpec, num_envs: int) -> Slots:
@@ -211,7 +220,7 @@ class ProcessPool:
     def send(self) -> None:
         """Wake the workers that have something to do."""
         for k, worker in enumerate(self._workers):
-            if self.slots.command[worker.envs.start : worker.envs.stop].any():
+            if self._busy(k):
                 self._await_ready(k)
                 self._waiting.append(k)
                 with suppress(OSError):  # it is dead, and `receive` will see it
@@ -220,7 +229,8 @@ class ProcessPool:
     def receive(self) -> list[Lost]:
         """Wait for the workers that `send` woke."""
         lost: list[Lost] = []
-        deadline = time.monotonic() + self._timeout
+        patience = self._timeout * max((self._busy(k) for k in self._waiting), default=0)
+        deadline = time.monotonic() + patience
         while self._waiting:
             by_connection = {self._workers[k].connection: k for k in self._waiting}
             ready = wait(list(by_connection), max(0.0, deadline - time.monotonic()))
@@ -237,7 +247,7 @@ class ProcessPool:
                 lost += answer
             if not ready:
                 for k in self._waiting:
-                    lost += self._replace(k, f"no answer within {self._timeout:g} seconds")
+                    lost += self._replace(k, f"no answer within {patience:g} seconds")
                 self._waiting.clear()
         self._patience.watch(self.slots, lost)
         return lost
@@ -246,9 +256,15 @@ class ProcessPool:
         """Ask workers to end, and end those that do not."""
         for worker in self._workers:
             worker.connection.close()
+        deadline = time.monotonic() + CLOSE_TIMEOUT
         for worker in self._workers:
-            worker.process.join(5)
+            worker.process.join(max(0.0, deadline - time.monotonic()))
             _end(worker)
+
+    def _busy(self, k: int) -> int:
+        """How many environments of a worker have something to do, one after the other."""
+        envs = self._workers[k].envs
+        return int(np.count_nonzero(self.slots.command[envs.start : envs.stop]))
 
     def _start(self, envs: range) -> _Worker:
         ours, theirs = self._context.Pipe()
@@ -272,7 +288,10 @@ class ProcessPool:
         try:
             answer = worker.connection.recv()
         except (EOFError, OSError) as error:
-            raise UserError(f"a worker of {name} died before it was ready") from error
+            raise UserError(
+                f"a worker of {name} died before it was ready; a script that trains must do so "
+                'under if __name__ == "__main__":'
+            ) from error
         if answer is not None:
             raise answer
         self._ready[k] = True
@@ -289,6 +308,8 @@ class ProcessPool:
 def _work(connection: Connection, hosted: Hosted, memory: Any, num_envs: int, envs: range) -> None:
     """What a worker process does until its connection closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the learner's to answer
+    if hasattr(os, "setsid"):
+        os.setsid()  # so that what the simulator starts can be ended with it
     everything = _over(memory, empty_slots(hosted.spec, num_envs))
     try:
         bench = Bench(hosted, _map(lambda x: x[envs.start : envs.stop], everything))
@@ -309,9 +330,12 @@ def _work(connection: Connection, hosted: Hosted, memory: Any, num_envs: int, en
 
 
 def _end(worker: _Worker) -> None:
+    """Kill a worker that is still there, and whatever it has left behind."""
     if worker.process.is_alive():
         worker.process.kill()
-        worker.process.join()
+    with suppress(ProcessLookupError, PermissionError, AttributeError):
+        os.killpg(worker.process.pid, signal.SIGKILL)
+    worker.process.join()
 
 
 def _leaves(slots: Slots) -> list[np.ndarray]:

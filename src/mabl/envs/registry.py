@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
+from multiprocessing import current_process
 from typing import Any, NamedTuple
 
 import yaml
@@ -174,9 +175,11 @@ def make(name: str, kwargs: Sequence[str] = ()) -> CompiledEnv | Hosted:
 
     Raises UserError if there is none, and for arguments that it does not take.
     """
+    if getattr(current_process(), "_inheriting", False):
+        raise UserError('a script that trains must do so under if __name__ == "__main__":')
     given = parse_kwargs(kwargs)
     adapter, _, target = name.partition(":")
-    if target and adapter in ADAPTERS:
+    if adapter in ADAPTERS and ":" in name:
         return ADAPTERS[adapter](name, target, **given)
     entries = family(name)()
     if name not in entries:

@@ -1,8 +1,10 @@
 """SMAC, SMACv2 and whatever has their interface: `get_obs`, `get_state`, `get_avail_actions`."""
 
 import inspect
+import os
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -89,15 +91,21 @@ def make_generated(name: str, race: str, n_units: int, n_enemies: int, **kwargs:
 
 def _official(name: str, target: str, options: dict[str, Any]) -> Hosted:
     package = target.partition(".")[0]
-    game = "The game: Linux packages of StarCraft II 4.10 and its maps, their folder in SC2PATH."
+    missing = UserError(
+        f"{name} needs {package}: {INSTALL[package]}\n"
+        "and StarCraft II for Linux (4.10) with its maps; SC2PATH names their folder"
+    )
     try:
-        return make(name, target, options)
+        hosted = make(name, target, options)
     except UserError as error:
         if not isinstance(error.__cause__, ModuleNotFoundError):
             raise
-        raise UserError(f"{name} needs {package}: {INSTALL[package]}\n{game}") from error
+        raise missing from error
     except KeyError as error:
         raise UserError(f"{name}: {package} has no map {error}") from error
+    if not Path(os.environ.get("SC2PATH", "~/StarCraftII")).expanduser().is_dir():
+        raise missing
+    return hosted
 
 
 def make(
@@ -160,8 +168,8 @@ class SmacEnv:
         else:
             reward, terminated, info = answer
             truncated = bool(info.get("episode_limit", False))
-        if terminated and not info:
-            raise RuntimeError("the game crashed")
+            if terminated and not info:
+                raise RuntimeError("the game crashed")
         won = bool(info.get("battle_won", False))
         terminated = bool(terminated) and not truncated
         row = self._row(action, float(np.mean(reward)), terminated, bool(truncated), float(won))
