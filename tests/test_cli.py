@@ -67,8 +67,11 @@ def rows_of(folder):
 
 MISTAKES = {
     "environment": (["train", "--env", "smax/3n"], "unknown environment 'smax/3n': did you mean"),
-    "family": (["train", "--env", "smac/3m"], "unknown environment 'smac/3m'"),
-    "task": (["train", "--env", "3m"], "unknown environment '3m': did you mean smax/3m?"),
+    "family": (["train", "--env", "smox/3m"], "unknown environment 'smox/3m'"),
+    "task": (
+        ["train", "--env", "3m"],
+        "unknown environment '3m': did you mean smac/3m or smax/3m?",
+    ),
     "algorithm": (["train", "--algo", "mable"], "unknown algorithm 'mable': did you mean mabl or"),
     "preset": (["train", "--preset", "quik"], "unknown preset 'quik': did you mean quick?"),
     "command": (["trian"], "unknown command 'trian': did you mean train?"),

@@ -28,6 +28,7 @@ from mabl.behaviour.qmix import (
     experience,
     td_loss,
 )
+from mabl.envs.base import Discrete
 from mabl.envs.coordination import CoordinationEnv
 from mabl.nets.mlp import MLP
 from mabl.training.loop import Training
@@ -340,7 +341,7 @@ def bandit() -> Game:
     )
     qmix = QMIX(TINY)
     first = jax.tree.map(lambda x: x[0, 0], view)
-    return Game(qmix, jax.jit(qmix.init, static_argnums=1)(first, 3, KEY), trajectory)
+    return Game(qmix, jax.jit(qmix.init, static_argnums=1)(first, Discrete(3), KEY), trajectory)
 
 
 @pytest.fixture(scope="module")

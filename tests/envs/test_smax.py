@@ -170,7 +170,7 @@ def test_names_and_sizes():
     assert rows["smax/2s_vs_1sc"][1:6] == (2, 39, 39, 6, 300)
     assert rows["smax/corridor"][1:6] == (6, 387, 360, 29, 400)
     assert "test/counting" in rows
-    for name in ("smax/3s_vs_6z", "3m", "smac/3m"):
+    for name in ("smax/3s_vs_6z", "3m", "smox/3m"):
         with pytest.raises(UserError, match=f"unknown environment '{name}'.*smax/3s_vs_4z"):
             registry.make(name)
 
