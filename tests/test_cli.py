@@ -70,7 +70,7 @@ MISTAKES = {
     "family": (["train", "--env", "smox/3m"], "unknown environment 'smox/3m'"),
     "task": (
         ["train", "--env", "3m"],
-        "unknown environment '3m': did you mean smac/3m or smax/3m?",
+        "unknown environment '3m': did you mean smac/3m or smax/3m",
     ),
     "algorithm": (["train", "--algo", "mable"], "unknown algorithm 'mable': did you mean mabl or"),
     "preset": (["train", "--preset", "quik"], "unknown preset 'quik': did you mean quick?"),
