@@ -1,4 +1,4 @@
-"""The command line: train, resume, eval, envs, algos."""
+"""The command line: train, resume, eval, envs, check-env, algos."""
 
 import errno
 import json
@@ -179,6 +179,36 @@ def evaluate(arguments: list[str]) -> int:
     return 0
 
 
+@dataclass(frozen=True)
+class CheckArguments:
+    """Play random episodes in an environment, and say whether one can learn there."""
+
+    env: tyro.conf.Positional[str]
+    """Environment, e.g. pettingzoo:module:factory."""
+    env_kwargs: tuple[str, ...] = ()
+    """Arguments that it is made with: KEY=VALUE, values in YAML."""
+    episodes: int = 5
+    """Episodes to play."""
+    seed: int = 0
+    """Of the first episode."""
+
+
+def check_env(arguments: list[str]) -> int:
+    """Check an environment with a random policy."""
+    given = tyro.cli(CheckArguments, args=arguments, prog="mabl check-env")
+    if given.episodes < 1:
+        raise UserError(f"--episodes is {given.episodes}: give a number above 0")
+    from mabl.checking import check
+    from mabl.envs import registry
+
+    findings = check(registry.make(given.env, given.env_kwargs), given.episodes, given.seed)
+    table = Table(show_header=False, box=None)
+    for verdict, what, message in findings:
+        table.add_row({"good": "ok", "look": "look", "bad": "BAD"}[verdict], what, message)
+    print_table(table)
+    return int(any(finding.verdict == "bad" for finding in findings))
+
+
 def list_envs(arguments: list[str]) -> None:
     """List environments."""
     tyro.cli(lambda: None, args=arguments, prog="mabl envs", description=list_envs.__doc__)
@@ -242,5 +272,6 @@ COMMANDS = {
     "resume": resume,
     "eval": evaluate,
     "envs": list_envs,
+    "check-env": check_env,
     "algos": list_algos,
 }
