@@ -2,9 +2,14 @@
 
 from dataclasses import replace
 
+import jax
+import numpy as np
+
 from mabl.algorithms.config import Config
 from mabl.algorithms.presets import preset
 from mabl.algorithms.registry import entry
+from mabl.training.loop import TrainState
+from mabl.training.programs import programs
 
 SIZES = {
     "training": {
@@ -57,3 +62,23 @@ def flags(algo: str, env: str) -> list[str]:
             for field in changed
         ]
     return given
+
+
+def learn_a_cycle(config: Config, replay_capacity: int) -> TrainState:
+    """Collect an episode, then collect another and learn: the schedule of a config with small
+    networks and batches."""
+    small = {name: SIZES[name] for name in ("world_model", "imagination", "mappo")}
+    small["training"] = {"replay_capacity": replay_capacity}
+    config = replace(
+        config,
+        num_workers=0,
+        **{name: replace(getattr(config, name), **new) for name, new in small.items()},
+    )
+    run = programs(config)
+    states = run.init(jax.random.key(0)[None])
+    with run.open_cycle(config) as cycle:
+        states, _ = cycle(states, 0, 0)
+        states, metrics = cycle(states, 2, 1)
+    assert metrics["episodes/count"] == 1
+    assert all(np.isfinite(value).all() for value in jax.device_get(metrics).values())
+    return states

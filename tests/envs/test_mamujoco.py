@@ -1,19 +1,15 @@
 """Multi-agent MuJoCo, row by row against the library's own environment."""
 
-from dataclasses import replace
-
-import jax
 import numpy as np
 import pytest
 from gymnasium_robotics import mamujoco_v1
 from numpy.testing import assert_allclose, assert_array_equal
-from tests.tiny import SIZES
+from tests.tiny import learn_a_cycle
 
 from mabl.algorithms.presets import preset
 from mabl.envs import registry
 from mabl.envs.base import Continuous
 from mabl.errors import UserError
-from mabl.training.programs import programs
 
 
 def symlog(x):
@@ -102,20 +98,7 @@ def test_paper_presets_learn_for_a_cycle(robot, rates):
     mappo, model = config.mappo, config.world_model
     found = mappo.actor_learning_rate, mappo.critic_learning_rate, model.learning_rate
     assert found == rates and config.training.collect_steps is None
-    small = ("world_model", "imagination", "mappo")
-    config = replace(
-        config,
-        num_workers=0,
-        training=replace(config.training, replay_capacity=4_000),
-        **{name: replace(getattr(config, name), **SIZES[name]) for name in small},
-    )
-    run = programs(config)
-    states = run.init(jax.random.key(0)[None])
-    with run.open_cycle(config) as cycle:
-        states, _ = cycle(states, 0, 0)
-        states, metrics = cycle(states, 2, 1)
-    assert metrics["episodes/count"] == 1
-    assert all(np.isfinite(value).all() for value in jax.device_get(metrics).values())
+    learn_a_cycle(config, replay_capacity=4_000)
 
 
 def test_without_the_extra_its_name_is_said(monkeypatch):

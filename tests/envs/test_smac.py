@@ -1,19 +1,15 @@
 """SMAC's interface, through a fake that answers and refuses as the official one does."""
 
-from dataclasses import replace
-
-import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from tests.tiny import SIZES
+from tests.tiny import learn_a_cycle
 
 from mabl.algorithms.presets import preset
 from mabl.envs import registry, smac
 from mabl.envs.base import Discrete
 from mabl.envs.pool import RESET, STEP, open_pool
 from mabl.errors import UserError
-from mabl.training.programs import programs
 
 OWN = "smac:tests.envs.fake_smac"
 ALL_TYPES = pytest.mark.parametrize("kind", ["FakeSMAC", "Cousin", "Lite"])
@@ -117,17 +113,7 @@ def test_the_paper_preset_of_every_map_learns_for_a_cycle(map_name, monkeypatch)
     config = preset("paper", f"smac/{map_name}", "mabl")
     assert config.world_model.learning_rate == (5e-4 if map_name == "3s_vs_5z" else 3e-4)
     assert config.training.reward_scale == 1 and config.training.collect_steps is None
-    small = ("world_model", "imagination", "mappo")
-    config = replace(
-        config, num_workers=0, **{n: replace(getattr(config, n), **SIZES[n]) for n in small}
-    )
-    run = programs(config)
-    states = run.init(jax.random.key(0)[None])
-    with run.open_cycle(config) as cycle:
-        states, _ = cycle(states, 0, 0)
-        states, metrics = cycle(states, 2, 1)
-    assert metrics["episodes/count"] == 1
-    assert all(np.isfinite(value).all() for value in jax.device_get(metrics).values())
+    learn_a_cycle(config, replay_capacity=1_000)
 
 
 @pytest.mark.parametrize(

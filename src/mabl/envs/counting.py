@@ -1,12 +1,13 @@
 """A test environment whose every field says which step of which episode it belongs to."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from mabl.envs.base import Discrete, EnvSpec
+from mabl.envs.counting_host import HostCountingEnv
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 
@@ -27,15 +28,7 @@ class CountingEnv:
     ones are truncated at row 7. Agent 1 is dead from row 4 on.
     """
 
-    spec = EnvSpec(
-        name="test/counting",
-        n_agents=2,
-        obs_dim=4,
-        state_dim=2,
-        action_space=Discrete(3),
-        episode_limit=7,
-        score_name="score",
-    )
+    spec = replace(HostCountingEnv.spec, name="test/counting")
 
     def reset(self, key: PRNGKey) -> tuple[CountingState, TimeStep]:
         """Start an episode with a random number below 1000."""
