@@ -48,7 +48,7 @@ class ParallelEnv:
         episode_limit: int | None = None,
         symlog: bool = False,
     ):
-        self._squash = squash if symlog else np.asarray
+        self._symlog = symlog
         self._env = env = made(name, load_factory(name, target, FACTORY), kwargs)
         if not hasattr(env, "possible_agents"):
             raise UserError(
@@ -67,8 +67,10 @@ class ParallelEnv:
         discrete = isinstance(self._actors[0], DiscreteActor)
         limit = episode_limit or limit_of(env) or DEFAULT_LIMIT
         obs_dim = self._width + (0 if self._identity is None else len(agents))
-        env.reset(seed=0)
+        obs, _ = env.reset(seed=0)
         state = state_of(env)
+        if state is not None and self._is_all_there_is_to_see(state, obs):
+            state = None  # not worth having it worked out again
         self._has_state = state is not None
         self.spec = EnvSpec(
             name=name,
@@ -119,19 +121,21 @@ class ParallelEnv:
     ) -> TimeStep:
         n, space = self.spec.n_agents, self.spec.action_space
         seen = np.zeros((n, self.spec.obs_dim), np.float32)
-        available = np.zeros((n, space.size), bool)
+        available = self._mask.copy()
         for i, (agent, watcher) in enumerate(zip(self._agents, self._watchers, strict=True)):
             if alive[i] and agent in obs:
-                seen[i, : watcher.size] = self._squash(watcher.flat(obs[agent]))
+                seen[i, : watcher.size] = watcher.flat(obs[agent])
                 if self._identity is not None:
                     seen[i, self._width :] = self._identity[i]
-            if alive[i] and not self._terminated[i]:
-                mask = watcher.mask(obs.get(agent), infos.get(agent, {}))
-                available[i] = self._mask[i]
-                if mask is not None and mask.any():
-                    available[i, : len(mask)] = mask
-        if isinstance(space, Discrete):
-            available[~available.any(-1), 0] = True  # those that are gone
+            if not alive[i] or self._terminated[i]:
+                available[i] = False
+                available[i, 0] = isinstance(space, Discrete)
+                continue
+            mask = watcher.mask(obs.get(agent), infos.get(agent, {}))
+            if mask is not None and mask.any():
+                available[i, : len(mask)] = mask
+        if self._symlog:
+            seen[:, : self._width] = squash(seen[:, : self._width])
         reward = np.array([float(rewards.get(agent, 0.0)) for agent in self._agents], np.float32)
         self._return += float(reward.mean())
         ended = self._terminated.all()
@@ -151,7 +155,13 @@ class ParallelEnv:
 
     def _state(self, seen: np.ndarray) -> np.ndarray:
         state = state_of(self._env) if self._has_state else None
-        return seen.ravel() if state is None else self._squash(state)
+        if state is None:
+            return seen.ravel()
+        return squash(state) if self._symlog else state
+
+    def _is_all_there_is_to_see(self, state: np.ndarray, obs: Mapping) -> bool:
+        seen = [w.flat(obs[a]) for a, w in zip(self._agents, self._watchers, strict=True)]
+        return np.array_equal(state, np.concatenate(seen))
 
 
 class Watcher:
@@ -168,10 +178,13 @@ class Watcher:
             self.size = spaces.flatdim(space)
         except (NotImplementedError, ValueError) as error:
             raise UserError(f"{name}: {agent} observes {space}, which has no fixed size") from error
+        self._is_box = isinstance(space, spaces.Box)
         self._space, self._flatten = space, spaces.flatten
 
     def flat(self, obs: Any) -> np.ndarray:
         """As a vector, parts of a dictionary one after the other."""
+        if self._is_box:
+            return np.asarray(obs, np.float32).ravel()
         if self._masked:
             obs = {k: v for k, v in obs.items() if k != "action_mask"}
         return np.asarray(self._flatten(self._space, obs), np.float32)
