@@ -105,7 +105,8 @@ class ParallelEnv:
         obs, rewards, terminations, truncations, infos = self._env.step(chosen)
         self._t += 1
         self._cut = not self._env.agents or all(truncations.get(a, False) for a in self._env.agents)
-        self._terminated |= [bool(terminations.get(agent, False)) for agent in self._agents]
+        if any(terminations.values()):
+            self._terminated |= [bool(terminations.get(agent, False)) for agent in self._agents]
         return self._row(action, obs, infos, rewards, [agent in live for agent in self._agents])
 
     def render(self) -> np.ndarray:
@@ -136,13 +137,13 @@ class ParallelEnv:
                 available[i, : len(mask)] = mask
         if self._symlog:
             seen[:, : self._width] = squash(seen[:, : self._width])
-        reward = np.array([float(rewards.get(agent, 0.0)) for agent in self._agents], np.float32)
-        self._return += float(reward.mean())
+        paid = [float(rewards.get(agent, 0.0)) for agent in self._agents]
+        self._return += sum(paid) / n
         ended = self._terminated.all()
         truncated = not ended and (self._cut or self._t >= self.spec.episode_limit)
         return TimeStep(
             prev_action=action,
-            reward=reward,
+            reward=np.array(paid, np.float32),
             terminated=self._terminated.copy(),
             truncated=np.bool_(truncated),
             obs=seen,
