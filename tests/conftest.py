@@ -37,6 +37,15 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.xdist_group(item.module.__name__))
 
 
+@pytest.fixture(scope="session")
+def cluster():
+    """A Ray cluster of this machine alone, which workers join."""
+    ray = pytest.importorskip("ray")
+    ray.init("local", num_cpus=3, include_dashboard=False, log_to_driver=False)
+    yield
+    ray.shutdown()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
     """Programs hold on to thousands of memory maps each, and a process may have 65,530 in all."""

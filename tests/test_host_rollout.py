@@ -16,7 +16,7 @@ from mabl import replay as replays
 from mabl.envs import registry
 from mabl.envs.counting_host import HostCountingEnv
 from mabl.envs.host import Hosted
-from mabl.envs.pool import open_pool
+from mabl.envs.workers import open_pool
 from mabl.evaluation import evaluate
 from mabl.execution import RandomExecutor
 from mabl.host_rollout import HostRollouts, act_where, start_hosted

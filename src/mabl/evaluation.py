@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from mabl.envs.base import CompiledEnv, EnvSpec
 from mabl.envs.host import Hosted
-from mabl.envs.pool import Pool, open_pool
+from mabl.envs.pool import Pool
+from mabl.envs.workers import open_pool
 from mabl.errors import UserError
 from mabl.execution import Executor, Memory, RandomExecutor
 from mabl.host_rollout import HostRollouts, act_where, start_hosted

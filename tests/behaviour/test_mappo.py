@@ -360,6 +360,28 @@ def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fres
     assert same(plain.critic, updated(1.0, nothing)[0].critic)
 
 
+@pytest.mark.parametrize(("value_decay", "learned"), [(0.9, True), (1.0, False)])
+def test_normalised_returns_of_any_size_are_learned(fresh, value_decay, learned):
+    config = replace(TINY, gamma=0.0, value_decay=value_decay)
+    pay = jnp.full((2, 16, 2), 500.0).at[:, 0].set(700.0)
+    trajectory = random_trajectory(3, 16, reward=pay)
+    state = fresh
+    for number in range(3):
+        state, _ = mappo.update(state, trajectory, jax.random.key(number), config)
+    value = jax.vmap(state.value)(trajectory.view.critic_features[0])
+    assert (abs(value.mean() - 512.5) < 100) == learned
+    mean, std = state.returns.moments()
+    weight = trajectory.weight
+    expected = (weight * pay).sum() / weight.sum()
+    assert_allclose(
+        [mean, std],
+        [expected, jnp.sqrt((weight * (pay - expected) ** 2).sum() / weight.sum())]
+        if learned
+        else [0, 1],
+        rtol=1e-3,
+    )
+
+
 def some_replayed(b: int, t: int) -> Replayed:
     """Sequences `[B, T]` of one episode each, in which every row pays 1."""
     blank = jax.tree.map(lambda x: jnp.zeros((b, t, *x.shape), x.dtype), reset_row())

@@ -9,7 +9,8 @@ from tests.envs.misbehaving import hosted
 
 from mabl.envs.counting_host import HostCountingEnv
 from mabl.envs.host import Hosted
-from mabl.envs.pool import IDLE, RESET, STEP, ProcessPool, open_pool
+from mabl.envs.pool import IDLE, RESET, STEP
+from mabl.envs.workers import open_pool
 from mabl.errors import UserError
 
 COUNTING = Hosted(HostCountingEnv.spec, HostCountingEnv)
@@ -17,12 +18,17 @@ GOOD, BAD = 4, 5
 """Seeds: numbers of a good episode and of one in which something happens."""
 
 
+on_any = pytest.mark.parametrize("workers", ["processes", "ray"])
+
+
 @pytest.fixture
-def pool_of():
+def pool_of(request):
     pools = []
 
-    def make(hosted, num_envs, num_workers, timeout=60.0):
-        pools.append(open_pool(hosted, num_envs, num_workers, timeout))
+    def make(hosted, num_envs, num_workers, timeout=60.0, workers="processes"):
+        if workers == "ray":
+            request.getfixturevalue("cluster")
+        pools.append(open_pool(hosted, num_envs, num_workers, timeout, workers))
         return pools[-1]
 
     yield make
@@ -40,8 +46,9 @@ def tell(pool, command, seed=GOOD, action=0):
 
 
 @pytest.mark.parametrize("num_workers", [0, 1, 2, 3, None])
-def test_everyone_does_what_it_is_told(pool_of, num_workers):
-    pool = pool_of(COUNTING, 3, num_workers)
+@on_any
+def test_everyone_does_what_it_is_told(pool_of, num_workers, workers):
+    pool = pool_of(COUNTING, 3, num_workers, workers=workers)
     rows = pool.slots.rows
     assert tell(pool, RESET, seed=[4, 1005, 6]) == []
     np.testing.assert_array_equal(rows.state, [[0, 4], [0, 5], [0, 6]])
@@ -54,8 +61,9 @@ def test_everyone_does_what_it_is_told(pool_of, num_workers):
     np.testing.assert_array_equal(rows.reward, [[0, 0], [102, 102], [101, 102]])
 
 
-def test_workers_do_without_jax(pool_of):
-    pool = pool_of(hosted("tells of jax"), 1, 1)
+@on_any
+def test_workers_do_without_jax(pool_of, workers):
+    pool = pool_of(hosted("tells of jax"), 1, 1, workers=workers)
     pool.slots.rows.score[:] = 7
     assert tell(pool, RESET) == []
     assert pool.slots.rows.score == 0
@@ -69,8 +77,9 @@ def test_workers_do_without_jax(pool_of):
         ("raises", "ValueError: the train left the rails"),
     ],
 )
-def test_what_goes_wrong_costs_an_episode(pool_of, how, reason):
-    pool = pool_of(hosted(how, at=1, episodes=(BAD,)), 2, 2, timeout=2.0)
+@on_any
+def test_what_goes_wrong_costs_an_episode(pool_of, how, reason, workers):
+    pool = pool_of(hosted(how, at=1, episodes=(BAD,)), 2, 2, timeout=2.0, workers=workers)
     rows = pool.slots.rows
     assert tell(pool, RESET, seed=[BAD, GOOD]) == []
     (lost,) = tell(pool, STEP)
@@ -82,7 +91,6 @@ def test_what_goes_wrong_costs_an_episode(pool_of, how, reason):
 
 def test_a_killed_worker_costs_the_episodes_that_it_held(pool_of):
     pool = pool_of(COUNTING, 3, 2)
-    assert isinstance(pool, ProcessPool)
     tell(pool, RESET)
     two = next(w for w in pool._workers if len(w.envs) == 2)
     os.kill(two.process.pid, signal.SIGKILL)
@@ -113,6 +121,7 @@ def test_losses_are_forgiven_when_an_episode_is_finished(pool_of):
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])
+@on_any
 @pytest.mark.parametrize(
     ("how", "message"),
     [
@@ -120,17 +129,18 @@ def test_losses_are_forgiven_when_an_episode_is_finished(pool_of):
         ("gives another shape", r"gave reward of shape \(3,\), its spec says \(2,\)"),
     ],
 )
-def test_rows_that_nobody_can_learn_from_end_the_run(pool_of, how, message, num_workers):
-    pool = pool_of(hosted(how, at=1), 1, num_workers)
+def test_rows_that_nobody_can_learn_from_end_the_run(pool_of, how, message, num_workers, workers):
+    pool = pool_of(hosted(how, at=1), 1, num_workers, workers=workers)
     tell(pool, RESET)
     with pytest.raises(UserError, match=message):
         tell(pool, STEP)
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])
-def test_an_environment_that_cannot_be_made_says_why(pool_of, num_workers):
+@on_any
+def test_an_environment_that_cannot_be_made_says_why(pool_of, num_workers, workers):
     with pytest.raises(UserError, match=r"could not be made(.|\n)*no game here"):
-        tell(pool_of(hosted("cannot be made"), 1, num_workers), RESET)
+        tell(pool_of(hosted("cannot be made"), 1, num_workers, workers=workers), RESET)
 
 
 def test_closing_ends_the_processes(pool_of):

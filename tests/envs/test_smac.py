@@ -8,7 +8,8 @@ from tests.tiny import learn_a_cycle
 from mabl.algorithms.presets import preset
 from mabl.envs import registry, smac
 from mabl.envs.base import Discrete
-from mabl.envs.pool import RESET, STEP, open_pool
+from mabl.envs.pool import RESET, STEP
+from mabl.envs.workers import open_pool
 from mabl.errors import UserError
 
 OWN = "smac:tests.envs.fake_smac"

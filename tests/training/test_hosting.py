@@ -11,7 +11,7 @@ import pytest
 from tests.tiny import tiny
 
 from mabl import resume, train
-from mabl.envs.pool import ProcessPool
+from mabl.envs.pool import WorkerPool
 from mabl.evaluation import evaluate
 from mabl.policy import load_run
 from mabl.runs.checkpoint import Checkpoints
@@ -28,21 +28,39 @@ def metrics_of(folder):
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
-def test_killing_a_worker_costs_an_episode_and_not_the_run(tmp_path, monkeypatch):
+def kill_process(worker):
+    os.kill(worker.process.pid, signal.SIGKILL)
+
+
+def kill_actor(worker):
+    import ray
+
+    ray.kill(worker.actor)
+
+
+@pytest.mark.parametrize(
+    ("workers", "kill"),
+    [("processes", kill_process), ("ray", kill_actor)],
+)
+def test_killing_a_worker_costs_an_episode_and_not_the_run(
+    tmp_path, monkeypatch, request, workers, kill
+):
     """Two environments, each with a worker of its own."""
-    calls, receive = [], ProcessPool.receive
+    if workers == "ray":
+        request.getfixturevalue("cluster")
+    calls, receive = [], WorkerPool.receive
 
     def receive_or_kill(pool):
         calls.append(len(calls))
         if len(calls) == 130:
-            os.kill(pool._workers[1].process.pid, signal.SIGKILL)
+            kill(pool._workers[1])
         lost = receive(pool)
         losses.extend(lost)
         return lost
 
     losses = []
-    monkeypatch.setattr(ProcessPool, "receive", receive_or_kill)
-    config = replace(config_of("mabl", tmp_path, total_steps=300), num_workers=2)
+    monkeypatch.setattr(WorkerPool, "receive", receive_or_kill)
+    config = replace(config_of("mabl", tmp_path, total_steps=300), workers=workers, num_workers=2)
     with pytest.warns(UserWarning, match="environment 1 is dropped: its worker process died"):
         outcome = train(config)
     assert [lost.index for lost in losses] == [1]
@@ -94,19 +112,21 @@ def test_a_resumed_run_begins_new_episodes_and_cuts_the_old_ones(algo, tmp_path)
         assert_whole(replay_of(config_of(algo, tmp_path), folder), cuts=unfinished)
 
 
-def test_workers_make_no_difference(tmp_path):
+def test_workers_make_no_difference(tmp_path, cluster):
+    plain = config_of("mabl", tmp_path, total_steps=250)
     runs = [
-        train(replace(config_of("mabl", tmp_path / str(n), total_steps=250), num_workers=n))
-        for n in (0, 2)
+        train(plain),
+        train(replace(plain, num_workers=2)),
+        train(replace(plain, num_workers=2, workers="ray")),
     ]
-    one, other = (
+    one, *others = (
         [
             {k: v for k, v in row.items() if not k.startswith("time/")}
             for row in metrics_of(run.folders[0])
         ]
         for run in runs
     )
-    assert one == other
+    assert others == [one, one]
 
 
 def test_seeds_share_the_pool_and_equal_runs_of_their_own(tmp_path):

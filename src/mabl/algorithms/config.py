@@ -95,8 +95,10 @@ class Config:
     """Train seeds `seed .. seed + K - 1` in one program, each in its own run folder."""
     logdir: str = "runs"
     """Where run folders go: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP."""
+    workers: Literal["processes", "ray"] = "processes"
+    """Where environments that run in Python do so: on this machine, or in a Ray cluster."""
     num_workers: int | None = None
-    """Processes for environments that run in Python; 0: the learner's own; None: one a core."""
+    """How many workers; 0: the learner's own process; None: one for each core."""
     worker_timeout: float = 60.0
     """Seconds that they may take for a step or a reset before they are replaced."""
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -19,6 +19,7 @@ from mabl.envs.base import ActionSpace
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.ppo import clipped_surrogate
 from mabl.losses.returns import lambda_returns
+from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 
@@ -63,6 +64,9 @@ class MAPPOConfig:
     """Factor on the entropy bonus after every minibatch."""
     value_coef: float = 0.5
     """Factor on the critic's squared error."""
+    value_decay: float = 1.0
+    """What remains, after each policy update, of the running mean and variance that returns are
+    normalised by; 1 in the paper: they are not normalised."""
     replay_value_coef: float = 0.0
     """Weight of the critic's error on replayed sequences beside that on imagined ones (ADR 8); 0 in
     the paper."""
@@ -78,7 +82,7 @@ class MAPPOConfig:
         require_positive(
             self, "initial_std", "actor_learning_rate", "critic_learning_rate", "grad_clip", "clip"
         )
-        require_between(self, 0, 1, "gamma", "gae_lambda", "ent_decay")
+        require_between(self, 0, 1, "gamma", "gae_lambda", "ent_decay", "value_decay")
         require_between(self, 0, inf, "actor_weight_decay", "ent_coef", "value_coef")
         require_between(self, 0, inf, "replay_value_coef")
         if self.hidden % self.n_heads:
@@ -102,6 +106,12 @@ class ActorCritic(NamedTuple):
     actor_opt: optax.OptState
     critic_opt: optax.OptState
     ent_coef: Float[Array, ""]
+    returns: Normaliser
+    """Of what the critic learns."""
+
+    def value(self, features: Float[Array, "N G"]) -> Float[Array, " N"]:
+        """The critic's, in the rewards' units."""
+        return self.returns.restore(self.critic(features))
 
 
 class PPORows(NamedTuple):
@@ -150,6 +160,7 @@ class MAPPO(NamedTuple):
             actor_opt=actor_optimiser.init(eqx.filter(actor, eqx.is_array)),
             critic_opt=critic_optimiser.init(eqx.filter(critic, eqx.is_array)),
             ent_coef=jnp.float32(config.ent_coef),
+            returns=Normaliser.fresh(),
         )
 
     def actor(self, state: ActorCritic) -> Actor | ContinuousActor:
@@ -164,7 +175,7 @@ class MAPPO(NamedTuple):
 
     def value(self, state: ActorCritic, view: TeamView) -> Float[Array, " N"]:
         """The critic's."""
-        return state.critic(view.critic_features)
+        return state.value(view.critic_features)
 
     def update(
         self, state: ActorCritic, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
@@ -176,7 +187,7 @@ class MAPPO(NamedTuple):
         """
         real = None
         if self.config.replay_value_coef:
-            real = jax.vmap(lambda replayed: replayed_values(state.critic, replayed, self.config))(
+            real = jax.vmap(lambda replayed: replayed_values(state.value, replayed, self.config))(
                 replayed
             )
             real = jax.tree.map(lambda x: rearrange(x, "b t ... -> (b t) ..."), real)
@@ -321,7 +332,11 @@ def update(
 
     The critic learns from `replayed` rows too, all of them in every minibatch, if there are any.
     """
-    rows, metrics = experience(state.critic, trajectory, config)
+    rows, metrics = experience(state.value, trajectory, config)
+    returns = state.returns.update(rows.target, rows.weight, config.value_decay)
+    rows = rows._replace(target=returns.normalise(rows.target))
+    if replayed is not None:
+        replayed = replayed._replace(target=returns.normalise(replayed.target))
     batches = minibatches(key, rows.target.shape[0], config.batch_size, config.n_epochs)
     actor_optimiser, critic_optimiser = optimisers(config)
 
@@ -348,6 +363,7 @@ def update(
             actor_opt=actor_opt,
             critic_opt=critic_opt,
             ent_coef=state.ent_coef * config.ent_decay,
+            returns=returns,
         )
         return state, actor_metrics | critic_metrics
 

@@ -1,16 +1,11 @@
-"""Host environments in worker processes: many at once, and none can take the learner down."""
+"""Host environments in workers: many at once, and none can take the learner down."""
 
-import multiprocessing
-import os
-import signal
 import time
 import traceback
 import warnings
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from multiprocessing.connection import Connection, wait
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -24,9 +19,6 @@ IDLE, STEP, RESET = range(3)
 
 ATTEMPTS = 3
 """Times that a worker may be lost in a row, no episode finished between."""
-
-CLOSE_TIMEOUT = 5.0
-"""Seconds that workers may take to close their environments."""
 
 START_TIMEOUT = 120.0
 """Seconds that a worker may take to import and make its environments."""
@@ -70,21 +62,6 @@ class Pool(Protocol):
         ...
 
 
-def open_pool(hosted: Hosted, num_envs: int, num_workers: int | None, timeout: float) -> Pool:
-    """`num_envs` environments; 0 workers: in this process; None: as many as there are cores."""
-    if num_workers is None:
-        num_workers = n_cores()
-    if num_workers == 0:
-        return LocalPool(hosted, num_envs)
-    return ProcessPool(hosted, num_envs, min(num_workers, num_envs), timeout)
-
-
-def n_cores() -> int:
-    """Cores that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)  # which not every system has
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
 def empty_slots(spec: EnvSpec, num_envs: int) -> Slots:
     """Nothing asked, nothing answered."""
     space = spec.action_space
@@ -94,6 +71,12 @@ def empty_slots(spec: EnvSpec, num_envs: int) -> Slots:
         np.zeros((num_envs, spec.n_agents, *space.shape), space.dtype),
         empty_rows(spec, num_envs),
     )
+
+
+def map_slots(function: Callable[[np.ndarray], np.ndarray], slots: Slots) -> Slots:
+    """`function` of every array."""
+    asked = (function(x) for x in slots[:-1])
+    return Slots(*asked, TimeStep(*map(function, slots.rows)))
 
 
 class Bench:
@@ -192,28 +175,64 @@ class LocalPool:
         self._bench.close()
 
 
-class _Worker(NamedTuple):
-    process: Any
-    connection: Connection
+Answer = list[Lost] | UserError | None
+"""Of a worker: first, that its environments are made (None) or cannot be; then, what was lost."""
+
+
+class WorkerDied(Exception):
+    """There will be no answer."""
+
+
+class Worker(Protocol):
+    """Holds some of the environments, in a process somewhere."""
+
     envs: range
 
+    def ask(self) -> None:
+        """Have the commands of its slots carried out."""
+        ...
 
-class ProcessPool:
-    """Environments in processes of their own, started by spawn; rows pass through shared memory.
+    def answer(self) -> Answer:
+        """What it said, its rows being in the slots. Raises WorkerDied."""
+        ...
+
+
+class Crew(Protocol):
+    """How workers are had and spoken to."""
+
+    slots: Slots
+
+    def start(self, envs: range) -> Worker:
+        """A worker that makes its environments at once."""
+        ...
+
+    def wait(self, workers: Sequence[Worker], timeout: float) -> list[Worker]:
+        """Those of `workers` that have answered or died, or none after `timeout` seconds."""
+        ...
+
+    def kill(self, worker: Worker) -> None:
+        """End a worker that is of no more use, and whatever it has started."""
+        ...
+
+    def dismiss(self, workers: Sequence[Worker]) -> None:
+        """Let workers close their environments, and end."""
+        ...
+
+
+class WorkerPool:
+    """Environments in workers.
 
     A worker that dies, or does not answer within `timeout` seconds, is replaced; the episodes of
     its environments are lost.
     """
 
-    def __init__(self, hosted: Hosted, num_envs: int, num_workers: int, timeout: float):
-        self._hosted, self._timeout = hosted, timeout
-        self._context = multiprocessing.get_context("spawn")
-        self._plan = empty_slots(hosted.spec, num_envs)
-        self._memory = self._context.RawArray("b", sum(_room(x) for x in _leaves(self._plan)))
-        self.slots = _over(self._memory, self._plan)
+    def __init__(self, hosted: Hosted, crew: Crew, num_workers: int, timeout: float):
+        self.slots = crew.slots
+        self._spec, self._crew, self._timeout = hosted.spec, crew, timeout
+        num_envs = len(self.slots.command)
         self._patience = Patience(hosted.spec, num_envs)
         bounds = [round(i * num_envs / num_workers) for i in range(num_workers + 1)]
-        self._workers = [self._start(range(*b)) for b in pairwise(bounds)]
+        self._workers = [crew.start(range(*b)) for b in pairwise(bounds)]
         self._ready = [False] * num_workers
         self._waiting: list[int] = []
 
@@ -223,8 +242,7 @@ class ProcessPool:
             if self._busy(k):
                 self._await_ready(k)
                 self._waiting.append(k)
-                with suppress(OSError):  # it is dead, and `receive` will see it
-                    worker.connection.send_bytes(b"go")
+                worker.ask()
 
     def receive(self) -> list[Lost]:
         """Wait for the workers that `send` woke."""
@@ -232,19 +250,19 @@ class ProcessPool:
         patience = self._timeout * max((self._busy(k) for k in self._waiting), default=0)
         deadline = time.monotonic() + patience
         while self._waiting:
-            by_connection = {self._workers[k].connection: k for k in self._waiting}
-            ready = wait(list(by_connection), max(0.0, deadline - time.monotonic()))
-            for connection in ready:
-                k = by_connection[connection]  # pyright: ignore[reportArgumentType]
+            workers = [self._workers[k] for k in self._waiting]
+            ready = self._crew.wait(workers, max(0.0, deadline - time.monotonic()))
+            for worker in ready:
+                k = self._workers.index(worker)
                 self._waiting.remove(k)
                 try:
-                    answer = self._workers[k].connection.recv()
-                except (EOFError, OSError):
+                    answer = worker.answer()
+                except WorkerDied:
                     lost += self._replace(k, "its worker process died")
                     continue
                 if isinstance(answer, UserError):
                     raise answer
-                lost += answer
+                lost += answer or ()
             if not ready:
                 for k in self._waiting:
                     lost += self._replace(k, f"no answer within {patience:g} seconds")
@@ -254,112 +272,31 @@ class ProcessPool:
 
     def close(self) -> None:
         """Ask workers to end, and end those that do not."""
-        for worker in self._workers:
-            worker.connection.close()
-        deadline = time.monotonic() + CLOSE_TIMEOUT
-        for worker in self._workers:
-            worker.process.join(max(0.0, deadline - time.monotonic()))
-            _end(worker)
+        self._crew.dismiss(self._workers)
 
     def _busy(self, k: int) -> int:
         """How many environments of a worker have something to do, one after the other."""
         envs = self._workers[k].envs
         return int(np.count_nonzero(self.slots.command[envs.start : envs.stop]))
 
-    def _start(self, envs: range) -> _Worker:
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(
-            target=_work,
-            args=(theirs, self._hosted, self._memory, self._plan.command.size, envs),
-            name=f"mabl-worker-{envs.start}",
-            daemon=True,
-        )
-        process.start()
-        theirs.close()
-        return _Worker(process, ours, envs)
-
     def _await_ready(self, k: int) -> None:
         """Raises UserError if the environments cannot be made."""
         if self._ready[k]:
             return
-        worker, name = self._workers[k], self._hosted.spec.name
-        if not worker.connection.poll(START_TIMEOUT):
+        worker, name = self._workers[k], self._spec.name
+        if not self._crew.wait([worker], START_TIMEOUT):
             raise UserError(f"a worker of {name} was not ready after {START_TIMEOUT:g} seconds")
         try:
-            answer = worker.connection.recv()
-        except (EOFError, OSError) as error:
-            raise UserError(
-                f"a worker of {name} died before it was ready; a script that trains must do so "
-                'under if __name__ == "__main__":'
-            ) from error
-        if answer is not None:
+            answer = worker.answer()
+        except WorkerDied as error:
+            raise UserError(f"a worker of {name} died before it was ready; {error}") from error
+        if isinstance(answer, UserError):
             raise answer
         self._ready[k] = True
 
     def _replace(self, k: int, reason: str) -> list[Lost]:
         worker = self._workers[k]
-        worker.connection.close()
-        _end(worker)
+        self._crew.kill(worker)
         self._ready[k] = False
-        self._workers[k] = self._start(worker.envs)
+        self._workers[k] = self._crew.start(worker.envs)
         return [Lost(index, reason) for index in worker.envs]
-
-
-def _work(connection: Connection, hosted: Hosted, memory: Any, num_envs: int, envs: range) -> None:
-    """What a worker process does until its connection closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the learner's to answer
-    if hasattr(os, "setsid"):
-        os.setsid()  # so that what the simulator starts can be ended with it
-    everything = _over(memory, empty_slots(hosted.spec, num_envs))
-    try:
-        bench = Bench(hosted, _map(lambda x: x[envs.start : envs.stop], everything))
-    except UserError as error:
-        connection.send(error)
-        return
-    try:
-        connection.send(None)
-        while True:
-            connection.recv_bytes()
-            try:
-                answer = [Lost(envs[i], reason) for i, reason in bench.obey()]
-            except UserError as error:
-                answer = error
-            connection.send(answer)
-    except (EOFError, OSError):
-        bench.close()
-
-
-def _end(worker: _Worker) -> None:
-    """Kill a worker that is still there, and whatever it has left behind."""
-    if worker.process.is_alive():
-        worker.process.kill()
-    with suppress(ProcessLookupError, PermissionError, AttributeError):
-        os.killpg(worker.process.pid, signal.SIGKILL)
-    worker.process.join()
-
-
-def _leaves(slots: Slots) -> list[np.ndarray]:
-    return [slots.command, slots.seed, slots.action, *slots.rows]
-
-
-def _room(array: np.ndarray) -> int:
-    """Bytes, up to the next cache line."""
-    return -(-array.nbytes // 64) * 64
-
-
-def _map(function: Any, slots: Slots) -> Slots:
-    command, seed, action, *rows = map(function, _leaves(slots))
-    return Slots(command, seed, action, TimeStep(*rows))
-
-
-def _over(memory: Any, plan: Slots) -> Slots:
-    """Slots like `plan` in shared memory, field after field."""
-    raw, offset = np.frombuffer(memory, np.uint8), 0
-
-    def place(like: np.ndarray) -> np.ndarray:
-        nonlocal offset
-        piece = raw[offset : offset + like.nbytes].view(like.dtype).reshape(like.shape)
-        offset += _room(like)
-        return piece
-
-    return _map(place, plan)

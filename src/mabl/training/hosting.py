@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from mabl.algorithms.config import Config
 from mabl.envs.host import Hosted
-from mabl.envs.pool import open_pool
+from mabl.envs.workers import open_pool
 from mabl.execution import Memory, executor_of
 from mabl.host_rollout import HostRollouts, act_where
 from mabl.training.loop import Training, TrainState, cycle_keys
@@ -83,7 +83,7 @@ def hosted_cycle(
 
     @contextmanager
     def open_cycle(config: Config) -> Iterator[Cycle]:
-        pool = open_pool(env, n_envs, config.num_workers, config.worker_timeout)
+        pool = open_pool(env, n_envs, config.num_workers, config.worker_timeout, config.workers)
         try:
             rollouts = HostRollouts(pool, env.spec, *training.rows_wanted)
             yield partial(cycle, rollouts)

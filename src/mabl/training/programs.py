@@ -33,7 +33,7 @@ class Programs(NamedTuple):
 
 _UNCOMPILED = (
     *("preset", "seed", "total_steps", "logdir"),
-    *("num_workers", "worker_timeout"),
+    *("workers", "num_workers", "worker_timeout"),
 )
 """Fields of a config that no program depends on."""
 

@@ -1,0 +1,121 @@
+"""Workers as actors of a Ray cluster; rows pass through Ray. Needs the extra `ray`."""
+
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+from mabl.envs.host import Hosted
+from mabl.envs.pool import Answer, Bench, Lost, Slots, WorkerDied, empty_slots, map_slots
+from mabl.errors import UserError
+from mabl.rows import TimeStep
+
+
+def join_cluster() -> int:
+    """Join the cluster at `RAY_ADDRESS`, or one that runs here, or start one; its cores.
+
+    Raises UserError without the extra, and if there is no such cluster.
+    """
+    # Ray would have every worker install the project anew where the learner was started by uv.
+    os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
+    try:
+        import ray
+    except ImportError as error:
+        raise UserError("Ray workers need an extra: pip install 'mabl[ray]'") from error
+    if not ray.is_initialized():
+        try:
+            ray.init(log_to_driver=False, logging_level="warning")
+        except ConnectionError as error:
+            raise UserError(
+                f"no Ray cluster answers at {os.environ.get('RAY_ADDRESS', 'this machine')}: "
+                "start it, or unset RAY_ADDRESS to use this machine"
+            ) from error
+    return max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+
+class RayWorker:
+    """An actor, and its answer to come."""
+
+    def __init__(self, actor: Any, slots: Slots, envs: range):
+        self.actor, self.envs = actor, envs
+        self._slots = map_slots(lambda x: x[envs.start : envs.stop], slots)
+        self.coming = actor.make.remote()
+
+    def ask(self) -> None:
+        """Send its slots' commands."""
+        slots = self._slots
+        self.coming = self.actor.obey.remote(slots.command, slots.seed, slots.action)
+
+    def answer(self) -> Answer:
+        """What it said. Raises WorkerDied."""
+        import ray
+
+        try:
+            answer = ray.get(self.coming)
+        except ray.exceptions.RayError as error:
+            raise WorkerDied(str(error)) from error
+        if not isinstance(answer, tuple):
+            return answer
+        lost, rows = answer
+        for mine, new in zip(self._slots.rows, rows, strict=True):
+            mine[:] = new
+        return [Lost(self.envs[index], reason) for index, reason in lost]
+
+
+class RayCrew:
+    """Actors of one core each, wherever the cluster has room."""
+
+    def __init__(self, hosted: Hosted, num_envs: int):
+        import ray
+
+        self.slots = empty_slots(hosted.spec, num_envs)
+        self._ray: Any = ray
+        self._hosted = ray.put(hosted)
+
+    def start(self, envs: range) -> RayWorker:
+        """Ask the cluster for one."""
+        actor = self._ray.remote(num_cpus=1)(_Actor).remote(self._hosted, len(envs))
+        return RayWorker(actor, self.slots, envs)
+
+    def wait(self, workers: Sequence[RayWorker], timeout: float) -> list[RayWorker]:
+        """Those whose answers have come; all of them, if all come in time."""
+        by_answer = {worker.coming: worker for worker in workers}
+        ready, _ = self._ray.wait(list(by_answer), num_returns=len(by_answer), timeout=timeout)
+        return [by_answer[coming] for coming in ready]
+
+    def kill(self, worker: RayWorker) -> None:
+        """Without leave to close."""
+        self._ray.kill(worker.actor)
+
+    def dismiss(self, workers: Sequence[RayWorker]) -> None:
+        """Actors end when they have closed and nobody holds them."""
+        closing = [worker.actor.close.remote() for worker in workers]
+        with suppress(self._ray.exceptions.RayError):
+            self._ray.wait(closing, num_returns=len(closing), timeout=5)
+        for worker in workers:
+            self.kill(worker)
+
+
+class _Actor:
+    """A bench of environments, somewhere in the cluster."""
+
+    def __init__(self, hosted: Hosted, num_envs: int):
+        self._hosted = hosted
+        self._slots = empty_slots(hosted.spec, num_envs)
+
+    def make(self) -> UserError | None:
+        try:
+            self._bench = Bench(self._hosted, self._slots)
+        except UserError as error:
+            return error
+
+    def obey(self, *asked: Any) -> tuple[list[Lost], TimeStep] | UserError:
+        for mine, new in zip(self._slots, asked, strict=False):
+            mine[:] = new
+        try:
+            return self._bench.obey(), self._slots.rows
+        except UserError as error:
+            return error
+
+    def close(self) -> None:
+        self._bench.close()
