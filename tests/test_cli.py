@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 from mabl import Policy, TeamPolicy, UserError, cli
+from mabl.envs.coordination import CoordinationEnv
 from mabl.runs import folder as run_folder
 
 COORDINATION = ["--env=test/coordination"]
@@ -128,6 +130,16 @@ MISTAKES = {
         ["eval", "--policy", "heuristic", "--env", "test/counting"],
         "test/counting has no heuristic policy: use --policy random",
     ),
+    "nothing to film": (["play"], "give either a run folder or --policy random|heuristic"),
+    "no film": (["play", "--policy=random", "--env=smax/3m"], "a baseline has no run folder"),
+    "kind of film": (
+        ["play", "--policy=random", "--env=smax/3m", "--video=film.avi"],
+        "film.avi ends in neither .mp4 nor .gif",
+    ),
+    "invisible": (
+        ["play", "--policy=random", "--env=test/counting", "--video=film.gif"],
+        "test/counting cannot be seen: it draws nothing",
+    ),
     "episodes": (
         ["eval", "--policy=random", "--env=test/counting", "--episodes=0"],
         "--episodes is 0",
@@ -170,6 +182,31 @@ def test_a_logdir_that_cannot_be_written_is_named(mabl, tmp_path):
     (tmp_path / "file").write_text("in the way")
     code, _, err = mabl("train", *TINY, f"--logdir={tmp_path}/file")
     assert code == 2 and "cannot write to" in err and "choose another --logdir" in err
+
+
+class Squares:
+    """Pictures as bright as the clock."""
+
+    frames_per_second = 5.0
+
+    def frames(self, before, after):
+        yield np.full((8, 8, 3), 9 * int(after.t), np.uint8)
+
+
+@pytest.mark.parametrize("greedy", ["--greedy", "--sample"])
+def test_a_run_is_filmed_in_its_own_folder_or_where_one_likes(
+    trained, mabl, tmp_path, monkeypatch, greedy
+):
+    monkeypatch.setattr(CoordinationEnv, "drawing", lambda _: Squares(), raising=False)
+    film = tmp_path / "films" / "film.gif"
+    code, out, err = mabl("play", trained, greedy, "--episodes=2", f"--video={film}")
+    assert code == 0 and out == f"{film}\n"
+    assert err.count(" steps\n") == 2 and err.startswith("score ")
+    with Image.open(film) as opened:
+        assert opened.n_frames > 2
+    code, out, _ = mabl("play", trained, greedy)
+    (path,) = (trained / "videos").iterdir()
+    assert code == 0 and out == f"{path}\n" and path.stem == "step_608" and path.stat().st_size
 
 
 @pytest.mark.parametrize("reason", [errno.EACCES, errno.EROFS, errno.ENOSPC])

@@ -1,4 +1,4 @@
-"""The command line: train, resume, eval, envs, check-env, algos."""
+"""The command line: train, resume, eval, play, envs, check-env, algos."""
 
 import errno
 import json
@@ -7,7 +7,7 @@ import sys
 from argparse import ArgumentParser
 from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 from rich.console import Console
@@ -17,6 +17,8 @@ from mabl.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
     from mabl.algorithms.config import Config
+
+T = TypeVar("T")
 
 PIPED_WIDTH = 160
 """Columns of a table that goes to a file or another program."""
@@ -114,8 +116,8 @@ def resume(arguments: list[str]) -> int:
 
 
 @dataclass(frozen=True)
-class EvalArguments:
-    """Play episodes with a trained policy, or with a baseline, and print what came of it."""
+class PlayerArguments:
+    """Who plays, and where."""
 
     run: tyro.conf.Positional[Path | None] = None
     """Run folder of a trained policy."""
@@ -125,49 +127,77 @@ class EvalArguments:
     """Environment; default: the run's own."""
     env_kwargs: tuple[str, ...] = ()
     """Arguments that it is made with: KEY=VALUE, values in YAML."""
-    episodes: int = 32
-    """Episodes to play."""
     greedy: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
     """Take the likeliest action; --no-greedy or --sample draws it from the policy."""
     seed: int = 0
     """Decides the episodes."""
+
+
+@dataclass(frozen=True)
+class EvalArguments(PlayerArguments):
+    """Play episodes with a trained policy, or with a baseline, and print what came of it."""
+
+    episodes: int = 32
+    """Episodes to play."""
     num_workers: int | None = None
     """Processes for environments that run in Python; 0: this one; None: one a core."""
     json: bool = False
     """Print one JSON object."""
 
 
-def evaluate(arguments: list[str]) -> int:
-    """Play episodes with a trained policy or a baseline."""
-    arguments = ["--no-greedy" if a == "--sample" else a for a in arguments]
-    given = tyro.cli(EvalArguments, args=arguments, prog="mabl eval")
-    if (given.run is None) == (given.policy is None):
+@dataclass(frozen=True)
+class PlayArguments(PlayerArguments):
+    """Film episodes of a trained policy, or of a baseline."""
+
+    video: Path | None = None
+    """Where to: a .mp4 or .gif; default: the run's own folder."""
+    episodes: int = 1
+    """Episodes to film."""
+
+
+def parse_player(arguments: type[T], given: list[str], prog: str) -> T:
+    """Arguments of those that play episodes. Raises UserError for what cannot be meant."""
+    given = ["--no-greedy" if a == "--sample" else a for a in given]
+    parsed: Any = tyro.cli(arguments, args=given, prog=prog)
+    if (parsed.run is None) == (parsed.policy is None):
         raise UserError("give either a run folder or --policy random|heuristic with --env")
-    if given.episodes < 1:
-        raise UserError(f"--episodes is {given.episodes}: give a number above 0")
-    if not 0 <= given.seed < 2**32:
-        raise UserError(f"--seed is {given.seed}: give a number from 0 to {2**32 - 1}")
-    import jax
+    if parsed.policy is not None and parsed.env is None:
+        raise UserError(f"--policy {parsed.policy} needs --env: mabl envs lists them")
+    if parsed.episodes < 1:
+        raise UserError(f"--episodes is {parsed.episodes}: give a number above 0")
+    if not 0 <= parsed.seed < 2**32:
+        raise UserError(f"--seed is {parsed.seed}: give a number from 0 to {2**32 - 1}")
+    return parsed
 
-    from mabl.evaluation import baseline, summary
-    from mabl.evaluation import evaluate as play
 
-    use_compilation_cache()
+def player(given: PlayerArguments) -> tuple[Any, Any, dict[str, Any]]:
+    """Environment, executor, and what to say of them."""
     if given.run is not None:
         from mabl.policy import load_run
 
         loaded = load_run(given.run, given.env, given.env_kwargs, given.greedy)
-        env, executor = loaded.env, loaded.executor
         subject = {"run": str(given.run), "step": loaded.step, "greedy": given.greedy}
-    else:
-        if given.env is None:
-            raise UserError(f"--policy {given.policy} needs --env: mabl envs lists them")
-        from mabl.envs import registry
+        return loaded.env, loaded.executor, subject
+    from mabl.envs import registry
+    from mabl.evaluation import baseline
 
-        env = registry.make(given.env, given.env_kwargs)
-        executor = baseline(given.policy or "", env)
-        subject = {"policy": given.policy}
-    results = play(env, executor, jax.random.key(given.seed), given.episodes, given.num_workers)
+    env = registry.make(given.env or "", given.env_kwargs)
+    return env, baseline(given.policy or "", env), {"policy": given.policy}
+
+
+def evaluate(arguments: list[str]) -> int:
+    """Play episodes with a trained policy or a baseline."""
+    given = parse_player(EvalArguments, arguments, "mabl eval")
+    import jax
+
+    from mabl.evaluation import evaluate as run_episodes
+    from mabl.evaluation import summary
+
+    use_compilation_cache()
+    env, executor, subject = player(given)
+    results = run_episodes(
+        env, executor, jax.random.key(given.seed), given.episodes, given.num_workers
+    )
     numbers = {"env": env.spec.name, **subject, **summary(results, env.spec)}
     if given.json:
         print(json.dumps(numbers))
@@ -176,6 +206,38 @@ def evaluate(arguments: list[str]) -> int:
         for key, value in numbers.items():
             table.add_row(key, f"{value:.3f}" if isinstance(value, float) else str(value))
         print_table(table)
+    return 0
+
+
+def play(arguments: list[str]) -> int:
+    """Film episodes of a trained policy or a baseline."""
+    given = parse_player(PlayArguments, arguments, "mabl play")
+    if given.run is None and given.video is None:
+        raise UserError("a baseline has no run folder: give --video out.gif")
+    import jax
+
+    from mabl import videos
+    from mabl.playing import Outcome, film, show_of
+
+    if given.video is not None:
+        videos.writer_for(given.video)
+    use_compilation_cache()
+    env, executor, subject = player(given)
+    ending = "mp4" if videos.can_write_mp4() else "gif"
+    path = given.video or Path(str(given.run)) / "videos" / f"step_{subject['step']}.{ending}"
+    console = Console(stderr=True)
+
+    def say(outcome: Outcome) -> None:
+        console.print(
+            f"{env.spec.score_name} {outcome.score:.2f}, return {outcome.episode_return:.2f}, "
+            f"{outcome.length} steps",
+            highlight=False,
+        )
+
+    with show_of(env) as show, console.status("playing ..."):
+        frames = film(show, executor, jax.random.key(given.seed), given.episodes, say)
+        videos.write(path, frames, show.frames_per_second)
+    print(path)
     return 0
 
 
@@ -271,6 +333,7 @@ COMMANDS = {
     "train": train,
     "resume": resume,
     "eval": evaluate,
+    "play": play,
     "envs": list_envs,
     "check-env": check_env,
     "algos": list_algos,

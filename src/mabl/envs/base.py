@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -90,10 +91,22 @@ class EnvSpec:
     """Each agent's own number of actions, where they differ; the rest is never available."""
 
 
+@runtime_checkable
+class Drawing(Protocol):
+    """Pictures of a compiled environment, one or several for each joint step."""
+
+    frames_per_second: float
+
+    def frames(self, before: EnvState | None, after: EnvState) -> Iterator[np.ndarray]:
+        """uint8 `[height, width, 3]`; `before` is None after a reset."""
+        ...
+
+
 class CompiledEnv(Protocol):
     """A pure environment that runs inside jit. It never resets itself.
 
-    Rows that it returns have no leading axes; callers vmap over environments.
+    Rows that it returns have no leading axes; callers vmap over environments. It may have
+    `drawing() -> Drawing`.
     """
 
     @property

@@ -17,7 +17,7 @@ from mabl.rows import TimeStep
 class HostEnv(Protocol):
     """One simulator. It never resets itself; its rows hold numpy arrays.
 
-    It may draw itself: `render() -> uint8 [height, width, 3]`.
+    It may draw itself: `render() -> uint8 [height, width, 3]`, and `frames_per_second`.
     """
 
     spec: EnvSpec
@@ -42,13 +42,15 @@ class Hosted:
     spec: EnvSpec
     make: Callable[[], HostEnv]
     """It travels to other processes: a class, a function of a module, or a `partial` of such."""
+    draw: Callable[[], HostEnv] | None = None
+    """Makes one that can be seen, where that differs."""
 
 
-def hosted_of(make: Callable[[], HostEnv]) -> Hosted:
+def hosted_of(make: Callable[[], HostEnv], draw: Callable[[], HostEnv] | None = None) -> Hosted:
     """Make one to learn its sizes and names."""
     env = make()
     try:
-        return Hosted(env.spec, make)
+        return Hosted(env.spec, make, draw)
     finally:
         env.close()
 

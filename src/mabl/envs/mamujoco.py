@@ -4,7 +4,10 @@ Observations and states are `symlog`s, as velocities reach thousands; actions in
 bounds of the joints. Every agent is paid the same.
 """
 
+import os
+import sys
 from collections.abc import Mapping
+from ctypes.util import find_library
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -58,20 +61,43 @@ def make(name: str, **kwargs: Any) -> Hosted:
 
     Raises UserError without the extra `mujoco`.
     """
+    choose_opengl()
     robot = ROBOTS[name.partition("/")[2]]
     options = {"scenario": robot.scenario, "split": robot.split, "agent_obsk": 0, **kwargs}
-    return hosted_of(partial(ParallelEnv, name, TARGET, options, STEPS, symlog=True))
+    make, draw = (
+        partial(ParallelEnv, name, TARGET, options | mode, STEPS, symlog=True)
+        for mode in ({}, {"render_mode": "rgb_array"})
+    )
+    return hosted_of(make, draw)
+
+
+def choose_opengl() -> None:
+    """Where there is no display, have MuJoCo draw without one; it asks when it is imported."""
+    if not has_opengl():
+        for library, name in (("OSMesa", "osmesa"), ("EGL", "egl")):
+            if find_library(library):
+                os.environ["MUJOCO_GL"] = name
+                return
+
+
+def has_opengl() -> bool:
+    """Whether MuJoCo has been told how to draw, or has a display to draw on."""
+    return sys.platform != "linux" or any(os.environ.get(x) for x in ("DISPLAY", "MUJOCO_GL"))
 
 
 def factory(scenario: str, split: str, **kwargs: Any) -> Any:
-    """The library's own environment."""
+    """The library's own environment. Raises UserError if it is to draw and cannot."""
+    if "render_mode" in kwargs and not has_opengl():
+        raise UserError("MuJoCo draws with OpenGL, and there is no display: apt install libosmesa6")
     try:
         from gymnasium_robotics import mamujoco_v1
     except ModuleNotFoundError as error:
         raise UserError("multi-agent MuJoCo needs an extra: pip install 'mabl[mujoco]'") from error
     if split == "legs":
         kwargs["agent_factorization"] = legs(scenario)
-    return mamujoco_v1.parallel_env(scenario, "9|8" if split == "legs" else split, **kwargs)
+    env = mamujoco_v1.parallel_env(scenario, "9|8" if split == "legs" else split, **kwargs)
+    env.metadata = env.metadata | {"render_fps": env.single_agent_env.metadata["render_fps"]}
+    return env
 
 
 def legs(scenario: str) -> Mapping[str, Any]:

@@ -3,7 +3,8 @@
 An agent is alive up to the row on which its own episode ends, that row included.
 """
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -34,7 +35,14 @@ def make(
     Episodes are truncated after `episode_limit` joint steps, if not before; `symlog` squashes
     observations and states. Raises UserError for what cannot be imported, made, or learned in.
     """
-    return hosted_of(partial(ParallelEnv, name, target, dict(kwargs), episode_limit, symlog))
+    seen = dict(kwargs)
+    if takes(load_factory(name, target, FACTORY), "render_mode"):
+        seen["render_mode"] = "rgb_array"
+    make, draw = (
+        partial(ParallelEnv, name, target, options, episode_limit, symlog)
+        for options in (dict(kwargs), seen)
+    )
+    return hosted_of(make, draw)
 
 
 class ParallelEnv:
@@ -112,6 +120,11 @@ class ParallelEnv:
     def render(self) -> np.ndarray:
         """What the environment draws, if it was made with `render_mode="rgb_array"`."""
         return np.asarray(self._env.render())
+
+    @property
+    def frames_per_second(self) -> float | None:
+        """Of its metadata."""
+        return (getattr(self._env, "metadata", None) or {}).get("render_fps")
 
     def close(self) -> None:
         """Let go of it."""
@@ -233,6 +246,15 @@ def actor_of(name: str, agent: Any, space: Any) -> DiscreteActor | ContinuousAct
     if isinstance(space, spaces.Box):
         return ContinuousActor(space)
     raise UserError(f"{name}: {agent} acts in {space}: Discrete or Box is needed")
+
+
+def takes(factory: Callable[..., Any], argument: str) -> bool:
+    """Whether a factory can be given an argument of that name."""
+    try:
+        parameters = inspect.signature(factory).parameters.values()
+    except ValueError:  # written in C
+        return False
+    return any(p.name == argument or p.kind is p.VAR_KEYWORD for p in parameters)
 
 
 def squash(x: np.ndarray) -> np.ndarray:

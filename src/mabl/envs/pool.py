@@ -5,7 +5,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -75,8 +75,9 @@ def empty_slots(spec: EnvSpec, num_envs: int) -> Slots:
 
 def map_slots(function: Callable[[np.ndarray], np.ndarray], slots: Slots) -> Slots:
     """`function` of every array."""
-    asked = (function(x) for x in slots[:-1])
-    return Slots(*asked, TimeStep(*map(function, slots.rows)))
+    command, seed, action, rows = slots
+    asked = function(command), function(seed), function(action)
+    return Slots(*asked, TimeStep(*map(function, rows)))
 
 
 class Bench:
@@ -197,36 +198,39 @@ class Worker(Protocol):
         ...
 
 
-class Crew(Protocol):
+W = TypeVar("W", bound=Worker)
+
+
+class Crew(Protocol[W]):
     """How workers are had and spoken to."""
 
     slots: Slots
 
-    def start(self, envs: range) -> Worker:
+    def start(self, envs: range) -> W:
         """A worker that makes its environments at once."""
         ...
 
-    def wait(self, workers: Sequence[Worker], timeout: float) -> list[Worker]:
+    def wait(self, workers: Sequence[W], timeout: float) -> list[W]:
         """Those of `workers` that have answered or died, or none after `timeout` seconds."""
         ...
 
-    def kill(self, worker: Worker) -> None:
+    def kill(self, worker: W) -> None:
         """End a worker that is of no more use, and whatever it has started."""
         ...
 
-    def dismiss(self, workers: Sequence[Worker]) -> None:
+    def dismiss(self, workers: Sequence[W]) -> None:
         """Let workers close their environments, and end."""
         ...
 
 
-class WorkerPool:
+class WorkerPool(Generic[W]):
     """Environments in workers.
 
     A worker that dies, or does not answer within `timeout` seconds, is replaced; the episodes of
     its environments are lost.
     """
 
-    def __init__(self, hosted: Hosted, crew: Crew, num_workers: int, timeout: float):
+    def __init__(self, hosted: Hosted, crew: Crew[W], num_workers: int, timeout: float):
         self.slots = crew.slots
         self._spec, self._crew, self._timeout = hosted.spec, crew, timeout
         num_envs = len(self.slots.command)

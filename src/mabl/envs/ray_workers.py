@@ -1,5 +1,6 @@
 """Workers as actors of a Ray cluster; rows pass through Ray. Needs the extra `ray`."""
 
+import logging
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -24,7 +25,7 @@ def join_cluster() -> int:
         raise UserError("Ray workers need an extra: pip install 'mabl[ray]'") from error
     if not ray.is_initialized():
         try:
-            ray.init(log_to_driver=False, logging_level="warning")
+            ray.init(log_to_driver=False, logging_level=logging.WARNING)
         except ConnectionError as error:
             raise UserError(
                 f"no Ray cluster answers at {os.environ.get('RAY_ADDRESS', 'this machine')}: "
@@ -49,10 +50,11 @@ class RayWorker:
     def answer(self) -> Answer:
         """What it said. Raises WorkerDied."""
         import ray
+        from ray.exceptions import RayError
 
         try:
             answer = ray.get(self.coming)
-        except ray.exceptions.RayError as error:
+        except RayError as error:
             raise WorkerDied(str(error)) from error
         if not isinstance(answer, tuple):
             return answer
@@ -110,7 +112,8 @@ class _Actor:
             return error
 
     def obey(self, *asked: Any) -> tuple[list[Lost], TimeStep] | UserError:
-        for mine, new in zip(self._slots, asked, strict=False):
+        slots = self._slots
+        for mine, new in zip((slots.command, slots.seed, slots.action), asked, strict=True):
             mine[:] = new
         try:
             return self._bench.obey(), self._slots.rows

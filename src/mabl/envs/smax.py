@@ -18,7 +18,7 @@ from jaxmarl.environments.smax.heuristic_enemy import HeuristicPolicyState
 from jaxmarl.environments.smax.smax_env import MAP_NAME_TO_SCENARIO, Scenario, State
 from jaxtyping import Array, Float, Int
 
-from mabl.envs.base import Discrete, EnvSpec
+from mabl.envs.base import Discrete, Drawing, EnvSpec
 from mabl.envs.smax_terrain import STOP, TerrainSMAX, Wall, attack_closest
 from mabl.errors import unknown_name
 from mabl.rows import TimeStep
@@ -136,6 +136,12 @@ class SmaxEnv:
     def heuristic(self) -> "HeuristicAllies":
         """The enemy's own heuristic for the allied side: a baseline."""
         return HeuristicAllies(self)
+
+    def drawing(self) -> Drawing:
+        """Pictures of battles."""
+        from mabl.envs.smax_drawing import SmaxDrawing
+
+        return SmaxDrawing(self)
 
     def _row(
         self, obs, game: State, enemy_policy, *, prev_action, reward, is_first

@@ -1,7 +1,7 @@
 """Opening a pool of the kind that a run asks for."""
 
 import os
-from typing import Literal
+from typing import Any, Literal
 
 from mabl.envs.host import Hosted
 from mabl.envs.pool import LocalPool, Pool, WorkerPool
@@ -24,9 +24,11 @@ def open_pool(
     if workers == "ray":
         from mabl.envs.ray_workers import RayCrew, join_cluster
 
-        cores, crew = join_cluster(), RayCrew(hosted, num_envs)
+        cores = join_cluster()
+        crew: Any = RayCrew(hosted, num_envs)
     else:
-        cores, crew = n_cores(), ProcessCrew(hosted, num_envs)
+        cores = n_cores()
+        crew = ProcessCrew(hosted, num_envs)
     return WorkerPool(hosted, crew, min(num_workers or cores, num_envs), timeout)
 
 
