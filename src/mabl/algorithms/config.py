@@ -150,7 +150,7 @@ def _value(hint: Any, value: Any, path: str) -> Any:
         return float(value)
     if type(value) in options:
         return value
-    if typing.get_origin(hint) is tuple and isinstance(value, list):
+    if typing.get_origin(hint) is tuple and isinstance(value, list | tuple):
         item = typing.get_args(hint)[0]
         return tuple(_value(item, part, f"{path}[{i}]") for i, part in enumerate(value))
     expected = " or ".join(getattr(option, "__name__", str(option)) for option in options)

@@ -4,10 +4,11 @@ Observations and states are `symlog`s, as velocities reach thousands; actions in
 bounds of the joints. Every agent is paid the same.
 """
 
+import ctypes
 import os
 import sys
 from collections.abc import Mapping
-from ctypes.util import find_library
+from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,6 +19,8 @@ from mabl.errors import UserError
 STEPS = 1_000
 """Joint steps after which an episode is truncated."""
 TARGET = "mabl.envs.mamujoco:factory"
+OPENGL = {"osmesa": ("libOSMesa.so.8", "libOSMesa.so.6"), "egl": ("libEGL.so.1",)}
+"""What draws without a display: in software, or on a graphics card."""
 
 
 class Robot(NamedTuple):
@@ -61,7 +64,6 @@ def make(name: str, **kwargs: Any) -> Hosted:
 
     Raises UserError without the extra `mujoco`.
     """
-    choose_opengl()
     robot = ROBOTS[name.partition("/")[2]]
     options = {"scenario": robot.scenario, "split": robot.split, "agent_obsk": 0, **kwargs}
     make, draw = (
@@ -71,24 +73,10 @@ def make(name: str, **kwargs: Any) -> Hosted:
     return hosted_of(make, draw)
 
 
-def choose_opengl() -> None:
-    """Where there is no display, have MuJoCo draw without one; it asks when it is imported."""
-    if not has_opengl():
-        for library, name in (("OSMesa", "osmesa"), ("EGL", "egl")):
-            if find_library(library):
-                os.environ["MUJOCO_GL"] = name
-                return
-
-
-def has_opengl() -> bool:
-    """Whether MuJoCo has been told how to draw, or has a display to draw on."""
-    return sys.platform != "linux" or any(os.environ.get(x) for x in ("DISPLAY", "MUJOCO_GL"))
-
-
 def factory(scenario: str, split: str, **kwargs: Any) -> Any:
     """The library's own environment. Raises UserError if it is to draw and cannot."""
-    if "render_mode" in kwargs and not has_opengl():
-        raise UserError("MuJoCo draws with OpenGL, and there is no display: apt install libosmesa6")
+    if "render_mode" in kwargs:
+        choose_opengl()
     try:
         from gymnasium_robotics import mamujoco_v1
     except ModuleNotFoundError as error:
@@ -98,6 +86,22 @@ def factory(scenario: str, split: str, **kwargs: Any) -> Any:
     env = mamujoco_v1.parallel_env(scenario, "9|8" if split == "legs" else split, **kwargs)
     env.metadata = env.metadata | {"render_fps": env.single_agent_env.metadata["render_fps"]}
     return env
+
+
+def choose_opengl() -> None:
+    """Where there is no display, have MuJoCo draw without one, unless it was told how to.
+
+    Raises UserError if there is no library that can.
+    """
+    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("MUJOCO_GL"):
+        return
+    for name, libraries in OPENGL.items():
+        for library in libraries:
+            with suppress(OSError):
+                ctypes.CDLL(library)
+                os.environ["MUJOCO_GL"] = name
+                return
+    raise UserError("MuJoCo draws with OpenGL, and there is no display: apt install libosmesa6")
 
 
 def legs(scenario: str) -> Mapping[str, Any]:

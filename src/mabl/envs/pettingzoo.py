@@ -227,14 +227,15 @@ class ContinuousActor:
     def __init__(self, space: Any):
         self.size, self._space = int(np.prod(space.shape)), space
         bounded = np.isfinite(space.low) & np.isfinite(space.high)
-        self._low = np.where(bounded, space.low, -1.0)
-        self._high = np.where(bounded, space.high, 1.0)
+        low, high = np.where(bounded, space.low, -1.0), np.where(bounded, space.high, 1.0)
+        self._middle, self._half = (low + high) / 2, (high - low) / 2
 
     def __call__(self, action: np.ndarray) -> np.ndarray:
         """From [-1, 1] to the environment's bounds."""
-        unit = (np.clip(action[: self.size], -1, 1).reshape(self._space.shape) + 1) / 2
-        stretched = self._low + unit * (self._high - self._low)
-        return np.clip(stretched.astype(self._space.dtype), self._space.low, self._space.high)
+        space, action = self._space, action[: self.size].reshape(self._space.shape)
+        unit = np.maximum(np.minimum(action, 1), -1)  # much faster than clip
+        stretched = (self._middle + unit * self._half).astype(space.dtype)
+        return np.maximum(np.minimum(stretched, space.high), space.low)
 
 
 def actor_of(name: str, agent: Any, space: Any) -> DiscreteActor | ContinuousActor:
