@@ -1,6 +1,6 @@
 """The railway as a graph and the tree that trains see of it, on maps small enough to draw."""
 
-from math import inf
+from math import inf, log
 
 import numpy as np
 import pytest
@@ -110,11 +110,19 @@ def test_a_circle_without_a_choice_ends_where_it_began():
     assert len(branch.nodes) == 4 and len(branch.exits) == 1
 
 
+def near(cells):
+    """How distances are told."""
+    return log(1 + cells) / 2
+
+
+FAR = near(100)
+
+
 def test_the_root_says_where_the_train_is():
     one = observe(RAILS, [train(2, 2, EAST, broken=True)])
     assert one.shape == (1, FEATURES)
     # row 2 of 3, column 2 of 7, luck, not deadlocked, broken, 4 cells to go, no switch, near one
-    assert_allclose(one[0, :9], [2 / 3, 2 / 7, 0.25, -1, -1, 0.04, -1, 1, -1], rtol=1e-6)
+    assert_allclose(one[0, :9], [2 / 3, 2 / 7, 0.25, -1, -1, near(4), -1, 1, -1], rtol=1e-6)
     assert observe(RAILS, [train(2, 3, EAST, ready=True)])[0, 6] == 1
     assert observe(RAILS, [train(2, 3, EAST, ready=True)])[0, 8] == 1
     assert observe(RAILS, [train(2, 3, EAST, deadlocked=True)])[0, 3] == 1
@@ -125,14 +133,14 @@ def test_edges_of_a_train_alone():
     tree = edges(vector)
     # One cell to the fork, where the target is 3 cells away, 1 nearer than from here.
     alone = [-1.0, -1, -1, -1, -1, 0, 0, -1]
-    assert_allclose(tree[0], [1, 1, 0.01, 1, 0.01, 0.01, *alone], rtol=1e-5)
+    assert_allclose(tree[0], [1, FAR, near(1), FAR, near(1), near(1), *alone], rtol=1e-5)
     assert_array_equal(tree[1], [-1] + [0] * 13)  # no second way on
     # Going north from the fork: 2 cells away, around the top, over the fork again as the fifth cell
     # (no switch on the way down), around the western end and back to the fork as the eleventh, 3
     # from the target. So the target is 9 + 3 from (1, 3), where it is 4 from here.
     north, east = tree[2], tree[3]
-    assert_allclose(north[1:6], [1, 0.11, 0.05, -0.08, 0.01], rtol=1e-5)
-    assert east[0] == 1 and east[4] == pytest.approx(0.02)
+    assert_allclose(north[1:6], [FAR, near(11), near(5), -near(8), near(1)], rtol=1e-5)
+    assert east[0] == 1 and east[4] == pytest.approx(near(2))
     assert_array_equal(tree[4:6, 0], [-1, -1])  # below the edge that is not there
     assert_array_equal(tree[10:14, 0], [-1] * 4)
 
@@ -144,10 +152,10 @@ def test_edges_tell_of_other_trains():
     # nearest 1 away; one the same way, one against with a higher number; the first goes the same
     # way and has a higher number; one is deadlocked
     assert_allclose(
-        tree[0, [1, 6, 7, 8, 9, 10, 11, 12, 13]], [0.01, 1, -1, 1, -1, 1, 1, 1, 1], rtol=1e-5
+        tree[0, [1, 6, 7, 8, 9, 10, 11, 12, 13]], [near(1), 1, -1, 1, -1, 1, 1, 1, 1], rtol=1e-5
     )
     tree = edges(observe(RAILS, [towards, me, ahead])[1])
-    assert_allclose(tree[0, [1, 8, 10, 11, 12]], [0.01, 1, -1, 1, 1], rtol=1e-5)
+    assert_allclose(tree[0, [1, 8, 10, 11, 12]], [near(1), 1, -1, 1, 1], rtol=1e-5)
     gone = [other._replace(on_rails=False) for other in (ahead, towards)]
     assert_array_equal(edges(observe(RAILS, [me, *gone])[0])[0], edges(observe(RAILS, [me])[0])[0])
 

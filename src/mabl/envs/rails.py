@@ -5,7 +5,7 @@ numbered row by row, headings are north, east, south, west.
 """
 
 from collections.abc import Sequence
-from math import inf
+from math import copysign, inf, log1p
 from typing import NamedTuple
 
 import numpy as np
@@ -132,7 +132,7 @@ def deadlocked(rails: Rails, trains: Sequence[Train]) -> set[int]:
 
 
 def observe(rails: Rails, trains: Sequence[Train]) -> np.ndarray:
-    """Observations `[N, 205]`; booleans are 1 and -1, distances in units of 100 cells.
+    """Observations `[N, 205]`; booleans are 1 and -1, distances log(1 + cells) / 2, 2.3 at most.
 
     Of the train (9): row and column as shares of the map, its luck, deadlocked, not broken,
     distance to its target, on a switch, near a decision, ready to depart.
@@ -229,8 +229,8 @@ class _Tree:
         """By how much the target is nearer there than here."""
         there = self._distance[node]
         if there == inf:
-            return -1.0
-        return max(-1.0, min(1.0, (self._here - there) / FAR))
+            return -_near(inf)
+        return copysign(_near(abs(self._here - there)), self._here - there)
 
 
 _NOTHING = [-1.0] + [0.0] * (EDGE_FEATURES - 1)
@@ -242,7 +242,8 @@ def _two(ways: list[tuple[int, int]]) -> list[tuple[int, int] | None]:
 
 
 def _near(distance: float) -> float:
-    return min(distance / FAR, 1.0)
+    """A cell counts much where distances are small, and little where they are great."""
+    return log1p(min(distance, FAR)) / 2
 
 
 def _sign(truth: bool) -> float:
