@@ -3,9 +3,9 @@
     uv run python -m benchmarks.adapters
 
 Each kind takes its turn for a second or so, again and again; ratios to the bare environment are of
-turns of one round, and their medians are printed, with the least and the greatest. Actions are drawn
-beforehand, resets are seeded and counted. `adapted` is rows in this process; `worker` is rows in
-shared memory, from one worker process that holds four environments. Flatland's bare environment
+turns of one round, and their medians are printed, with the least and the greatest. Actions are
+drawn beforehand, resets are seeded and counted. `adapted` is rows in this process; `worker` is rows
+in shared memory, from one worker process that holds four environments. Flatland's bare environment
 observes nothing; beside it stands the bundled tree of depth 2.
 """
 

@@ -3,19 +3,23 @@
     uv run python -m benchmarks.compare run --env smax/3m --seeds 0 1 2 --jobs 4
     uv run python -m benchmarks.compare collect --env smax/3m --raw docs/results/raw
     uv run python -m benchmarks.compare draw --env smax/3m --raw docs/results/raw --out 3m.png
+    uv run python -m benchmarks.compare draw --env flatland/5_agents --own-budgets --line random=.1
 
-`run` pins every run to a core of its own and leaves out what is finished. Win rate and return at a
-step are those of the training episodes in the window of steps before it.
+`run` pins every run to a core of its own and leaves out what is finished; what follows `--` are
+flags of `mabl train`. Score and return at a step are those of the training episodes in the window
+of steps before it. With `--own-budgets` algorithms are drawn, over a logarithm, to their own ends.
 """
 
 import argparse
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from operator import attrgetter
 from pathlib import Path
 from queue import Queue
 from typing import NamedTuple
@@ -27,6 +31,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from mabl.algorithms.registry import ALGORITHMS
+from mabl.envs import registry
 from mabl.runs.checkpoint import named
 from mabl.runs.folder import read_config
 from mabl.runs.metrics import read
@@ -37,10 +42,7 @@ WINDOW = 4_000
 LAST = 15_000
 """Environment steps at the end that the table averages over, as the paper's table 1."""
 EARLY = 20_000
-"""Environment steps at which the table looks at win rates early on."""
-EPISODES = 256
-"""Greedy episodes after training."""
-COLUMNS = ("step", "train/episodes", "train/win_rate", "train/episode_return", "time/seconds")
+"""Environment steps at which the table looks at scores early on."""
 
 
 class Run(NamedTuple):
@@ -48,18 +50,29 @@ class Run(NamedTuple):
 
     steps: np.ndarray
     episodes: np.ndarray
-    wins: np.ndarray
+    scores: np.ndarray
     returns: np.ndarray
     summary: dict
+
+
+def columns(score: str) -> tuple[str, ...]:
+    """Of a raw file."""
+    return ("step", "train/episodes", f"train/{score}", "train/episode_return", "time/seconds")
+
+
+def slug(env: str) -> str:
+    """A name that any file system takes."""
+    return re.sub(r"[^\w./]+", "-", env)
 
 
 # --- run --------------------------------------------------------------------------------------
 
 
-def run(env: str, algos: list[str], seeds: list[int], logdir: Path, jobs: int, flags: list[str]):
+def run(args: argparse.Namespace, flags: list[str]) -> None:
     """Train and evaluate every algorithm with every seed, `jobs` at a time."""
+    env, logdir = args.env, args.logdir
     cores: Queue[int] = Queue()
-    for core in sorted(os.sched_getaffinity(0))[:jobs]:
+    for core in sorted(os.sched_getaffinity(0))[: args.jobs]:
         cores.put(core)
 
     def one(algo: str, seed: int) -> None:
@@ -71,17 +84,18 @@ def run(env: str, algos: list[str], seeds: list[int], logdir: Path, jobs: int, f
                 *("mabl", "train", "--env", env, "--algo", algo, "--seed", str(seed)),
                 *("--logdir", str(logdir), *flags),
             ]
-            pinned(core, command, logdir / f"{env.replace('/', '-')}-{algo}-{seed}.log")
+            pinned(core, command, logdir / f"{slug(env).replace('/', '-')}-{algo}-{seed}.log")
             folder = max((logdir / env / algo / f"seed_{seed}").iterdir())
-            command = ["mabl", "eval", str(folder), "--episodes", str(EPISODES), "--json"]
-            pinned(core, command, folder / "eval.tmp")
-            (folder / "eval.tmp").rename(folder / "eval.json")
-            print(f"{env} {algo} seed {seed}: {(folder / 'eval.json').read_text().strip()}")
+            command = ["mabl", "eval", str(folder), "--episodes", str(args.episodes), "--json"]
+            for way in ("sample", "greedy"):
+                pinned(core, [*command, f"--{way}"], folder / "eval.tmp")
+                (folder / "eval.tmp").rename(folder / f"{way}.json")
+            print(f"{env} {algo} seed {seed}: {(folder / 'greedy.json').read_text().strip()}")
         finally:
             cores.put(core)
 
-    with ThreadPoolExecutor(jobs) as pool:
-        for done in [pool.submit(one, algo, seed) for algo in algos for seed in seeds]:
+    with ThreadPoolExecutor(args.jobs) as pool:
+        for done in [pool.submit(one, algo, seed) for algo in args.algos for seed in args.seeds]:
             done.result()
 
 
@@ -99,7 +113,7 @@ def pinned(core: int, command: list[str], log: Path) -> None:
 
 def finished(logdir: Path, env: str, algo: str, seed: int) -> list[Path]:
     """Run folders that have been evaluated, newest last."""
-    return sorted(path.parent for path in (logdir / env / algo).glob(f"seed_{seed}/*/eval.json"))
+    return sorted(path.parent for path in (logdir / env / algo).glob(f"seed_{seed}/*/greedy.json"))
 
 
 # --- collect ----------------------------------------------------------------------------------
@@ -107,23 +121,34 @@ def finished(logdir: Path, env: str, algo: str, seed: int) -> list[Path]:
 
 def collect(env: str, algos: list[str], seeds: list[int], logdir: Path, raw: Path) -> None:
     """Copy what counts of finished runs to `raw/ENV/ALGO/seed_N.*`."""
+    score = registry.make(env).spec.score_name
     for algo in algos:
         for seed in seeds:
             for folder in finished(logdir, env, algo, seed)[-1:]:
-                target = raw / env / algo
+                target = raw / slug(env) / algo
                 target.mkdir(parents=True, exist_ok=True)
                 for name in ("config.yaml", "versions.yaml"):
                     shutil.copy(folder / name, target / f"seed_{seed}-{name}")
                 rows = read(folder)
                 with (target / f"seed_{seed}.csv").open("w", newline="") as out:
                     writer = csv.writer(out, lineterminator="\n")
-                    writer.writerow(COLUMNS)
-                    writer.writerows([short(row.get(name)) for name in COLUMNS] for row in rows)
-                evaluation = json.loads((folder / "eval.json").read_text())
+                    writer.writerow(columns(score))
+                    writer.writerows(
+                        [short(row.get(name)) for name in columns(score)] for row in rows
+                    )
+                played = {
+                    way: json.loads((folder / f"{way}.json").read_text())
+                    for way in ("greedy", "sample")
+                }
                 summary = {
-                    "greedy_win_rate": evaluation["win_rate"],
-                    "greedy_return": evaluation["episode_return"],
-                    "greedy_episodes": evaluation["episodes"],
+                    f"{way}_{short_name}": results[name]
+                    for way, results in played.items()
+                    for short_name, name in (
+                        (score, score),
+                        ("return", "episode_return"),
+                        ("episodes", "episodes"),
+                    )
+                } | {
                     "seconds": sum(row["time/seconds"] for row in rows),
                     "parameters": count_parameters(folder),
                 }
@@ -151,11 +176,12 @@ def read_raw(folder: Path) -> list[Run]:
     for path in sorted(folder.glob("seed_*.csv")):
         with path.open() as file:
             rows = [row for row in csv.DictReader(file) if float(row["train/episodes"] or 0)]
-        steps, episodes, win_rate, episode_return = (
-            np.array([float(row[name]) for row in rows]) for name in COLUMNS[:4]
+        steps, episodes, score, episode_return = (
+            np.array(column, float)
+            for column in list(zip(*map(dict.values, rows), strict=True))[:4]
         )
         summary = json.loads(path.with_suffix(".json").read_text())
-        runs.append(Run(steps, episodes, episodes * win_rate, episodes * episode_return, summary))
+        runs.append(Run(steps, episodes, episodes * score, episodes * episode_return, summary))
     return runs
 
 
@@ -179,56 +205,83 @@ def draw_band(axis: Axes, grid: np.ndarray, label: str, means: np.ndarray, style
     axis.fill_between(grid[shown], low, high, color=line.get_color(), alpha=0.15, linewidth=0)
 
 
-def draw(env: str, algos: list[str], raw: Path, out: Path) -> None:
+def draw(args: argparse.Namespace) -> None:
     """Curves as a picture, and a Markdown table on stdout."""
-    groups = {algo: read_raw(raw / env / algo) for algo in algos}
+    score = registry.make(args.env).spec.score_name
+    groups = {algo: read_raw(args.raw / slug(args.env) / algo) for algo in args.algos}
     groups = {algo: runs for algo, runs in groups.items() if runs}
-    total = min(run.steps[-1] for runs in groups.values() for run in runs)
-    grid = np.arange(1_000, total + 1, 1_000)
-    figure = Figure(figsize=(11, 4.4), layout="constrained")
-    won, earned = figure.subplots(1, 2)
-    print(
-        f"| | win rate at {EARLY // 1000}k | win rate, last {LAST // 1000}k steps "
-        f"| return, last {LAST // 1000}k steps | greedy win rate | steps to 50% wins | minutes "
-        "| parameters |\n|---|---|---|---|---|---|---|---|"
-    )
-    for algo, runs in groups.items():
-        style = {
-            "linestyle": "-" if ALGORITHMS[algo].decentralised else "--",
-            "color": f"C{list(ALGORITHMS).index(algo)}",  # one colour in all pictures
-        }
-        rates = np.stack([curve(run, run.wins, grid) for run in runs])
-        draw_band(won, grid, algo, rates, style)
-        returns = np.stack([curve(run, run.returns, grid) for run in runs])
-        draw_band(earned, grid, algo, returns, style)
-        reached = [
-            next((int(g) for g, r in zip(grid, row, strict=True) if r >= 0.5), None)
-            for row in rates
-        ]
-        last = [
-            [
-                mean_between(r, sums, r.steps[-1] - LAST, r.steps[-1])
-                for r, sums in ((r, getattr(r, name)) for r in runs)
-            ]
-            for name in ("wins", "returns")
-        ]
-        early = [mean_between(run, run.wins, EARLY - WINDOW, EARLY) for run in runs]
-        print(
-            f"| {algo} | {listed(early)} | {listed(last[0])} | {listed(last[1])} "
-            f"| {listed([r.summary['greedy_win_rate'] for r in runs])} "
-            f"| {', '.join(f'{k:,}' if k else 'never' for k in reached)} "
-            f"| {np.mean([r.summary['seconds'] for r in runs]) / 60:.1f} "
-            f"| {runs[0].summary['parameters']:,} |"
-        )
-    won.set(ylabel="win rate in training", ylim=(0, None))
-    earned.set(ylabel="episode return in training", ylim=(0, None))
-    for axis in (won, earned):
-        axis.set(xlabel="environment steps")
+    ends = {algo: min(run.steps[-1] for run in runs) for algo, runs in groups.items()}
+    shared = min(ends.values())
+    grids = {
+        algo: np.arange(1_000, (end if args.own_budgets else shared) + 1, 1_000)
+        for algo, end in ends.items()
+    }
+    panels = {score: "scores"} if score == "score" else {score: "scores", "return": "returns"}
+    figure = Figure(figsize=(11, 4.4) if len(panels) == 2 else (7, 4.4), layout="constrained")
+    axes = np.ravel(figure.subplots(1, len(panels)))
+    for axis, (name, field) in zip(axes, panels.items(), strict=True):
+        for algo, runs in groups.items():
+            style = {
+                "linestyle": "-" if ALGORITHMS[algo].decentralised else "--",
+                "color": f"C{list(ALGORITHMS).index(algo)}",  # one colour in all pictures
+            }
+            curves = np.stack([curve(run, getattr(run, field), grids[algo]) for run in runs])
+            draw_band(axis, grids[algo], algo, curves, style)
+        axis.set(xlabel="environment steps", ylabel=f"{name.replace('_', ' ')} in training")
+        if args.own_budgets:
+            axis.set_xscale("log")
+        elif name in (score, "return") and axis.get_ylim()[0] > -1:
+            axis.set_ylim(0, None)
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.grid(alpha=0.3)
-    won.legend(frameon=False, ncols=2, title="dashed: centralised execution")
-    figure.suptitle(f"{env}: mean, lowest and highest of {len(runs)} seeds")
-    figure.savefig(out, dpi=130)
+    for k, line in enumerate(args.line):
+        label, value = line.split("=")
+        axes[0].axhline(float(value), color="grey", linestyle=(":", "-.")[k % 2], label=label)
+    axes[0].legend(frameon=False, ncols=2, title="dashed: centralised execution")
+    n_seeds = max(map(len, groups.values()))
+    figure.suptitle(f"{args.env}: mean, lowest and highest of {n_seeds} seeds")
+    figure.savefig(args.out, dpi=130)
+    print_table(groups, grids, score, int(shared), args.threshold)
+
+
+def print_table(
+    groups: dict[str, list[Run]],
+    grids: dict[str, np.ndarray],
+    score: str,
+    shared: int,
+    threshold: float,
+) -> None:
+    """Markdown; what is said `at` a step is of the window before it."""
+    name, last = score.replace("_", " "), f"last {LAST // 1000}k steps"
+    headings = [
+        *("", f"{name} at {EARLY // 1000}k", f"{name} at {shared // 1000}k", f"{name}, {last}"),
+        *(f"return, {last}", f"greedy {name}", f"sampled {name}", f"steps to {threshold:g}"),
+        *("steps", "minutes", "parameters"),
+    ]
+    print(f"| {' | '.join(headings)} |\n|{'---|' * len(headings)}")
+    for algo, runs in groups.items():
+        curves = [curve(run, run.scores, grids[algo]) for run in runs]
+        reached = [grids[algo][row >= threshold] for row in curves]
+        cells = [
+            algo,
+            *(
+                listed([mean_between(r, r.scores, k - WINDOW, k) for r in runs])
+                for k in (EARLY, shared)
+            ),
+            *(
+                listed([mean_between(r, sums(r), r.steps[-1] - LAST, r.steps[-1]) for r in runs])
+                for sums in (attrgetter("scores"), attrgetter("returns"))
+            ),
+            *(
+                listed([r.summary.get(f"{way}_{score}", np.nan) for r in runs])
+                for way in ("greedy", "sample")
+            ),
+            ", ".join(f"{steps[0]:,.0f}" if len(steps) else "never" for steps in reached),
+            f"{runs[0].steps[-1]:,.0f}",
+            f"{np.mean([r.summary['seconds'] for r in runs]) / 60:.1f}",
+            f"{runs[0].summary['parameters']:,}",
+        ]
+        print(f"| {' | '.join(cells)} |")
 
 
 def listed(values: list[float]) -> str:
@@ -246,16 +299,20 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--raw", type=Path, default=Path("docs/results/raw"))
     parser.add_argument("--out", type=Path, default=Path("curves.png"))
+    parser.add_argument("--episodes", type=int, default=256, help="to play after training")
+    parser.add_argument("--own-budgets", action="store_true")
+    parser.add_argument("--line", action="append", default=[], metavar="NAME=SCORE")
+    parser.add_argument("--threshold", type=float, default=0.5, help="of the score")
     given = sys.argv[1:]
     split = given.index("--") if "--" in given else len(given)
     args = parser.parse_args(given[:split])
     if args.command == "run":
         flags = given[split + 1 :]
-        run(args.env, args.algos, args.seeds, args.logdir, args.jobs, flags)
+        run(args, flags)
     elif args.command == "collect":
         collect(args.env, args.algos, args.seeds, args.logdir, args.raw)
     else:
-        draw(args.env, args.algos, args.raw, args.out)
+        draw(args)
 
 
 if __name__ == "__main__":
