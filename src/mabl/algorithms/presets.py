@@ -120,8 +120,23 @@ _QUICK = {
 _QUICK_SMAC = replace(
     _QUICK["smax"], training=replace(_QUICK["smax"].training, reward_scale=1.0, num_envs=8)
 )
-# Nothing is known of its rewards.
-_QUICK_OWN = replace(_QUICK_SMAC, world_model=replace(_QUICK_SMAC.world_model, reward_weight=1.0))
+# Nothing is known of its rewards; what is seen counts to a fine degree. Chosen on simple_spread.
+_FINE = replace(
+    _QUICK_SMAC.world_model,
+    n_categoricals=16,
+    n_classes=16,
+    obs_weight=400.0,
+    reward_weight=5.0,
+    overshooting=0.0,
+    learning_rate=2e-3,
+)
+_QUICK_OWN = replace(
+    _QUICK_SMAC,
+    total_steps=30_000,
+    world_model=_FINE,
+    mappo=replace(_QUICK_SMAC.mappo, value_decay=0.98, ent_coef=0.03),
+    imagination=ImaginationConfig(horizon=15, n_starts=160, sample_availability=False),
+)
 
 QUICK = _QUICK | {
     "smac": _QUICK_SMAC,
@@ -129,15 +144,30 @@ QUICK = _QUICK | {
     "pettingzoo": _QUICK_OWN,
     "flatland": replace(
         _QUICK_OWN,
-        total_steps=100_000,
-        mappo=replace(_QUICK_OWN.mappo, team_reward=False),
+        total_steps=60_000,
+        training=replace(
+            _QUICK_OWN.training, num_envs=16, prefill_steps=8_000, pretrain_updates=1_500
+        ),
+        world_model=replace(_FINE, obs_weight=20.0),
+        mappo=replace(
+            _QUICK_OWN.mappo,
+            value_decay=0.99,
+            ent_coef=0.2,
+            actor_learning_rate=3e-4,
+            team_reward=False,
+        ),
+        imagination=replace(_QUICK_OWN.imagination, horizon=12),
     ),
     # Five a step for standing upright.
     "mamujoco": replace(
         _QUICK_OWN,
-        total_steps=100_000,
-        training=replace(_QUICK_OWN.training, reward_scale=0.1, num_envs=4, collect_steps=32),
-        mappo=replace(_QUICK_OWN.mappo, ent_coef=0.003),
+        total_steps=60_000,
+        training=replace(_QUICK_OWN.training, reward_scale=0.1, collect_steps=32),
+        world_model=replace(
+            _FINE, n_categoricals=32, obs_weight=5.0, reward_weight=1.0, learning_rate=1e-3
+        ),
+        mappo=replace(_QUICK_OWN.mappo, ent_coef=0.001, actor_learning_rate=2e-4),
+        imagination=replace(_QUICK_OWN.imagination, horizon=12),
     ),
 }
 
