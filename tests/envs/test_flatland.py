@@ -12,6 +12,7 @@ from mabl.algorithms.presets import preset
 from mabl.envs import flatland, registry
 from mabl.envs.base import Discrete
 from mabl.errors import UserError
+from mabl.evaluation import baseline
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +117,18 @@ def test_deadlocked_trains_never_move_again_whatever_they_try(env):
                 assert env._env.agents[i].position == place
         seen += len(held)
     assert seen >= 2
+
+
+def test_the_heuristic_takes_the_shortest_path(env):
+    heuristic = baseline("heuristic", registry.make("flatland/5_agents"))
+    row, forks = env.reset(4), 0
+    while not (row.truncated or row.terminated.all()):
+        expected = shortest_path(row, env)
+        _, action = heuristic.act(None, row, jax.random.key(0))
+        np.testing.assert_array_equal(action, expected)
+        forks += int((expected == 1).sum())
+        row = env.step(expected)
+    assert forks > 3
 
 
 def test_nothing_to_decide_means_going_on(env):

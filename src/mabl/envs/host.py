@@ -45,6 +45,8 @@ class Hosted:
     """It travels to other processes: a class, a function of a module, or a `partial` of such."""
     draw: Callable[[], HostEnv] | None = None
     """Makes one that can be seen, where that differs."""
+    heuristic: Callable[[], Any] | None = None
+    """Makes an executor that is a baseline, if there is one."""
 
 
 def hosted_of(make: Callable[[], HostEnv], draw: Callable[[], HostEnv] | None = None) -> Hosted:

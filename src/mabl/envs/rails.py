@@ -14,10 +14,12 @@ DEPTH = 3
 """Branches ahead of a train, one after the other."""
 EDGES = 2 ** (DEPTH + 1) - 2
 ROOT_FEATURES, EDGE_FEATURES = 9, 14
+GAINED = 4
+"""Where an edge tells by how much the target is nearer at its first cell."""
 FEATURES = ROOT_FEATURES + EDGES * EDGE_FEATURES
 """Length of an observation: 205."""
 FAR = 100.0
-"""Cells that count as 1; what is further away, or not there, is 1 too."""
+"""Cells beyond which it does not matter how far; what is not there is as far."""
 
 LEFT, FORWARD, RIGHT = 1, 2, 3
 """The simulator's actions that move a train."""
