@@ -93,7 +93,11 @@ def test_what_draws_is_made_to_draw():
         (registry.make("test/counting"), "draws nothing"),
         (Hosted(HostCountingEnv.spec, HostCountingEnv), "draws nothing"),
         (Hosted(Drawn.spec, partial(Drawn, np.zeros(3))), r"drew something of shape \(3,\)"),
-        (Hosted(Drawn.spec, partial(Drawn, lambda: 1 / 0)), "failed to draw: division by zero"),
+        (Hosted(Drawn.spec, HostCountingEnv, lambda: 1 / 0), "while it was filmed: ZeroDiv"),
+        (
+            Hosted(Drawn.spec, partial(Drawn, lambda: 1 / 0)),
+            "failed while it was filmed: ZeroDivisionError",
+        ),
     ],
 )
 def test_what_cannot_be_seen_says_so(env, message):

@@ -55,3 +55,20 @@ def test_without_the_extra_there_are_gifs(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"mabl\[video\].*or give a \.gif"):
         videos.write(tmp_path / "film.mp4", shades(1, 4, 4), 8.0)
     videos.write(tmp_path / "film.gif", shades(1, 4, 4), 8.0)
+
+
+def test_a_film_that_fails_leaves_the_one_before(tmp_path):
+    path = tmp_path / "film.gif"
+    videos.write(path, shades(3, 4, 4), 8.0)
+    whole = path.read_bytes()
+    with pytest.raises(UserError, match=r"pictures are \(4, 4, 3\), and then \(5, 5, 3\)"):
+        videos.write(path, [*shades(2, 4, 4), *shades(1, 5, 5)], 8.0)
+    assert path.read_bytes() == whole and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("ending", ["gif", "mp4"])
+def test_a_folder_is_no_film(tmp_path, ending):
+    path = tmp_path / f"film.{ending}"
+    path.mkdir()
+    with pytest.raises(UserError, match="is a folder"):
+        videos.write(path, shades(3, 8, 8), 8.0)

@@ -1,4 +1,7 @@
-"""Playing episodes to look at: what `evaluation` counts, one picture after the other."""
+"""Playing episodes to look at, one picture after the other.
+
+Compiled environments play what `evaluation` counts with the same key; others play other episodes.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -51,7 +54,8 @@ def show_of(env: CompiledEnv | Hosted) -> Iterator[Show]:
             raise cannot
         yield _compiled(env, drawing())
         return
-    host = (env.draw or env.make)()
+    with _said(env.spec.name):
+        host = (env.draw or env.make)()
     try:
         if not hasattr(host, "render"):
             raise cannot
@@ -101,27 +105,36 @@ def _compiled(env: CompiledEnv, drawing: Drawing) -> Show:
 
 def _hosted(env: HostEnv, executor: Executor, key: PRNGKey) -> Iterator[tuple[TimeStep, Any]]:
     act = eqx.filter_jit(lambda executor, *at: executor.act(*at))
-    row = env.reset(int(jax.random.bits(key)))
+    with _said(env.spec.name):
+        row = env.reset(int(jax.random.bits(key)))
     memory, count = executor.initial(row), 0
     while True:
         yield row, [_render(env)]
         if is_last(row):
             return
         memory, action = act(executor, memory, row, jax.random.fold_in(key, count))
-        row, count = env.step(np.asarray(action)), count + 1
+        with _said(env.spec.name):
+            row, count = env.step(np.asarray(action)), count + 1
 
 
 def _render(env: Any) -> np.ndarray:
     """Raises UserError if what comes is no picture."""
-    try:
+    with _said(env.spec.name):
         frame = np.asarray(env.render())
-    except UserError:
-        raise
-    except Exception as error:
-        raise UserError(f"{env.spec.name} failed to draw: {error}") from error
     if frame.ndim != 3 or frame.shape[-1] not in (3, 4):
         raise UserError(
             f"{env.spec.name} drew something of shape {frame.shape}: its render() should give an "
             "array [height, width, 3]"
         )
     return frame[..., :3].astype(np.uint8)
+
+
+@contextmanager
+def _said(name: str) -> Iterator[None]:
+    """What an environment raises, in one line."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"{name} failed while it was filmed: {error!r}") from error

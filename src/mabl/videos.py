@@ -12,10 +12,34 @@ from mabl.errors import UserError
 
 
 def write(path: Path, frames: Iterable[np.ndarray], frames_per_second: float) -> None:
-    """Write frames, uint8 `[height, width, 3]` and all of one size, as they come."""
+    """Write frames, uint8 `[height, width, 3]`, as they come; an older film stays until then.
+
+    Raises UserError for frames of different sizes and for what the encoder cannot do.
+    """
     writer = writer_for(path)
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: give the name of a file")
     path.parent.mkdir(parents=True, exist_ok=True)
-    writer(path, iter(frames), frames_per_second)
+    unfinished = path.with_name(f"unfinished-{path.name}")
+    try:
+        unfinished.write_bytes(b"")  # says what forbids it, as encoders do not
+        writer(unfinished, _alike(iter(frames)), frames_per_second)
+        if not unfinished.stat().st_size:
+            raise UserError(f"{path} could not be written: ffmpeg gave nothing")
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _alike(frames: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    shape = None
+    for frame in frames:
+        shape = shape or frame.shape
+        if frame.shape != shape:
+            raise UserError(
+                f"a film's pictures are {shape}, and then {frame.shape}: keep their size"
+            )
+        yield frame
 
 
 def writer_for(path: Path) -> Callable[[Path, Iterator[np.ndarray], float], None]:
@@ -35,8 +59,10 @@ def writer_for(path: Path) -> Callable[[Path, Iterator[np.ndarray], float], None
 def can_write_mp4() -> bool:
     """Whether the extra is there."""
     try:
-        import imageio_ffmpeg  # noqa: F401
-    except ImportError:
+        import imageio_ffmpeg
+
+        imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError):  # RuntimeError: none for this machine
         return False
     return True
 
@@ -67,6 +93,8 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], frames_per_second: floa
     try:
         for frame in chain([first], map(_even, frames)):
             film.send(np.ascontiguousarray(frame))
+    except OSError as error:
+        raise UserError(f"ffmpeg gave up: {error}") from error
     finally:
         film.close()
 

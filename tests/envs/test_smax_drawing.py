@@ -13,6 +13,7 @@ from mabl.envs.smax_drawing import (
     HEADER,
     HEALTH,
     HEALTH_LOST,
+    LABELS,
     PICTURES,
     SCALE,
     TEAMS,
@@ -103,6 +104,12 @@ def test_the_hurt_have_shorter_bars_and_the_dead_none(fought):
 
     assert count(frame, HEALTH) < count(whole, HEALTH)
     assert count(frame, HEALTH_LOST) > count(whole, HEALTH_LOST) == 0
+
+
+@pytest.mark.parametrize("name", ["smax/3m", "smax/2s_vs_1sc", "smax/corridor"])
+def test_every_kind_of_unit_has_its_label(name):
+    labels = registry.make(name).drawing()._labels
+    assert set(labels) <= set(LABELS.values()) and len(set(labels)) == len(labels)
 
 
 def test_walls_are_seen():

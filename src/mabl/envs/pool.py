@@ -183,6 +183,11 @@ Answer = list[Lost] | UserError | None
 class WorkerDied(Exception):
     """There will be no answer."""
 
+    def __init__(self, why: str = "", before_ready: str = ""):
+        super().__init__(why)
+        self.why = f": {why}" if why else ""
+        self.before_ready = f"; {before_ready}" if before_ready else self.why
+
 
 class Worker(Protocol):
     """Holds some of the environments, in a process somewhere."""
@@ -205,6 +210,8 @@ class Crew(Protocol[W]):
     """How workers are had and spoken to."""
 
     slots: Slots
+    slow: str
+    """What may be the matter where a worker is not ready in time."""
 
     def start(self, envs: range) -> W:
         """A worker that makes its environments at once."""
@@ -261,8 +268,8 @@ class WorkerPool(Generic[W]):
                 self._waiting.remove(k)
                 try:
                     answer = worker.answer()
-                except WorkerDied:
-                    lost += self._replace(k, "its worker process died")
+                except WorkerDied as death:
+                    lost += self._replace(k, f"its worker process died{death.why}")
                     continue
                 if isinstance(answer, UserError):
                     raise answer
@@ -289,11 +296,15 @@ class WorkerPool(Generic[W]):
             return
         worker, name = self._workers[k], self._spec.name
         if not self._crew.wait([worker], START_TIMEOUT):
-            raise UserError(f"a worker of {name} was not ready after {START_TIMEOUT:g} seconds")
+            raise UserError(
+                f"a worker of {name} was not ready after {START_TIMEOUT:g} seconds{self._crew.slow}"
+            )
         try:
             answer = worker.answer()
         except WorkerDied as error:
-            raise UserError(f"a worker of {name} died before it was ready; {error}") from error
+            raise UserError(
+                f"a worker of {name} died before it was ready{error.before_ready}"
+            ) from error
         if isinstance(answer, UserError):
             raise answer
         self._ready[k] = True

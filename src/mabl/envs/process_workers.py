@@ -35,13 +35,14 @@ class ProcessWorker:
         try:
             return self.connection.recv()
         except (EOFError, OSError) as error:
-            raise WorkerDied(
-                'a script that trains must do so under if __name__ == "__main__":'
-            ) from error
+            hint = 'a script that trains must do so under if __name__ == "__main__":'
+            raise WorkerDied(before_ready=hint) from error
 
 
 class ProcessCrew:
     """Processes of this machine; each can be killed with all that it has started."""
+
+    slow = ""
 
     def __init__(self, hosted: Hosted, num_envs: int):
         self._hosted, self._num_envs = hosted, num_envs

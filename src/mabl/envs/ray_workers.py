@@ -26,10 +26,11 @@ def join_cluster() -> int:
     if not ray.is_initialized():
         try:
             ray.init(log_to_driver=False, logging_level=logging.WARNING)
-        except ConnectionError as error:
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            where = os.environ.get("RAY_ADDRESS", "this machine")
             raise UserError(
-                f"no Ray cluster answers at {os.environ.get('RAY_ADDRESS', 'this machine')}: "
-                "start it, or unset RAY_ADDRESS to use this machine"
+                f"no Ray cluster at {where} ({error}): start it, give RAY_ADDRESS as HOST:PORT, or "
+                "unset it to use this machine"
             ) from error
     return max(1, int(ray.cluster_resources().get("CPU", 1)))
 
@@ -55,7 +56,7 @@ class RayWorker:
         try:
             answer = ray.get(self.coming)
         except RayError as error:
-            raise WorkerDied(str(error)) from error
+            raise WorkerDied(f"{error}".strip().partition("\n")[0]) from error
         if not isinstance(answer, tuple):
             return answer
         lost, rows = answer
@@ -66,6 +67,8 @@ class RayWorker:
 
 class RayCrew:
     """Actors of one core each, wherever the cluster has room."""
+
+    slow = ": the cluster may have too few free cores, give fewer --num-workers"
 
     def __init__(self, hosted: Hosted, num_envs: int):
         import ray

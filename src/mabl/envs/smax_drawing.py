@@ -31,7 +31,7 @@ LABELS = {
     "zealot": "Ze",
     "zergling": "Zl",
     "hydralisk": "Hy",
-    "spine_crawler": "Sc",
+    "spine crawler": "Sc",
 }
 
 
