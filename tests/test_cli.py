@@ -198,7 +198,7 @@ def test_a_run_is_filmed_in_its_own_folder_or_where_one_likes(
     trained, mabl, tmp_path, monkeypatch, greedy
 ):
     monkeypatch.setattr(CoordinationEnv, "drawing", lambda _: Squares(), raising=False)
-    film = tmp_path / "films" / "film.gif"
+    film, trained = tmp_path / "films" / "film.gif", shutil.copytree(trained, tmp_path / "run")
     code, out, err = mabl("play", trained, greedy, "--episodes=2", f"--video={film}")
     assert code == 0 and out == f"{film}\n"
     assert err.count(" steps\n") == 2 and err.startswith("score ")
