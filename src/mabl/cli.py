@@ -122,7 +122,7 @@ class PlayerArguments:
     run: tyro.conf.Positional[Path | None] = None
     """Run folder of a trained policy."""
     policy: Literal["random", "heuristic"] | None = None
-    """Evaluate a baseline instead of a run; needs --env."""
+    """Play a baseline instead of a run; needs --env."""
     env: str | None = None
     """Environment; default: the run's own."""
     env_kwargs: tuple[str, ...] = ()
