@@ -255,7 +255,7 @@ def test_returns_on_the_counting_environment_with_a_constant_critic(counted):
     )
     learner = learner._replace(
         critic=lambda features, alive: jnp.full(features.shape[0], 4.0),
-        returns=Normaliser(jnp.float32(4), jnp.float32(17), jnp.float32(1)),
+        returns=Normaliser(jnp.float32(4), jnp.float32(1), jnp.float32(1)),
     )
     constant = jax.jit(lambda experience: algorithm.chunks(learner, experience))
     ends = set()
@@ -377,7 +377,7 @@ def test_gamma_and_lambda_are_the_flags():
 
 def test_the_critics_loss_by_hand():
     # Returns of mean 2 and variance 8 - 4 = 4. The critic says 1, which means 2 + 2 * 1 = 4.
-    returns = Normaliser(jnp.float32(2), jnp.float32(8), jnp.float32(1))
+    returns = Normaliser(jnp.float32(2), jnp.float32(4), jnp.float32(1))
     view = TeamView(
         jnp.zeros((1, 3, 2, 1)),
         jnp.ones((1, 3, 2, 1)),

@@ -7,10 +7,14 @@ from jaxtyping import Array, Float
 
 
 class Normaliser(NamedTuple):
-    """Exponential averages of values and of their squares, corrected for starting at nothing."""
+    """Exponentially weighted mean and variance of all values so far.
+
+    The variance is kept itself: from a mean of squares nothing is left of it in float32 where the
+    mean is a few thousand times larger than the deviation.
+    """
 
     mean: Float[Array, ""]
-    mean_square: Float[Array, ""]
+    variance: Float[Array, ""]
     weight: Float[Array, ""]
     """How much has been seen; 1 in the long run."""
 
@@ -26,20 +30,24 @@ class Normaliser(NamedTuple):
 
         A batch in which nothing counts changes nothing.
         """
-        decayed = jnp.where(weights.sum() > 0, decay, 1.0)
+        seen = weights.sum() > 0
         total = weights.sum() + 1e-8
         mean = (weights * values).sum() / total
-        mean_square = (weights * values**2).sum() / total
-        old = (self.mean, self.mean_square, self.weight)
-        new = (mean, mean_square, jnp.float32(1))
-        return Normaliser(*(decayed * a + (1 - decayed) * b for a, b in zip(old, new, strict=True)))
+        variance = (weights * (values - mean) ** 2).sum() / total
+        weight = decay * self.weight + (1 - decay)
+        share = (1 - decay) / jnp.maximum(weight, 1e-8)  # of the batch in all that counts
+        shift = mean - self.mean
+        after = Normaliser(
+            self.mean + share * shift,
+            (1 - share) * (self.variance + share * shift**2) + share * variance,
+            weight,
+        )
+        return Normaliser(*(jnp.where(seen, a, b) for a, b in zip(after, self, strict=True)))
 
     def moments(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Mean and standard deviation (0.1 at least; 0 and 1 before any value)."""
-        weight = jnp.maximum(self.weight, 1e-8)
-        mean = self.mean / weight
-        variance = jnp.maximum(self.mean_square / weight - mean**2, 1e-2)
-        return mean, jnp.where(self.weight > 0, jnp.sqrt(variance), 1.0)
+        std = jnp.sqrt(jnp.maximum(self.variance, 1e-2))
+        return self.mean, jnp.where(self.weight > 0, std, 1.0)
 
     def normalise(self, values: Float[Array, "*b"]) -> Float[Array, "*b"]:
         """Zero mean and unit variance, as far as is known."""
