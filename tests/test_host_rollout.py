@@ -204,7 +204,9 @@ def test_truncating_the_newest_row_of_an_empty_replay_changes_nothing():
 def test_evaluation_plays_whole_episodes(episodes):
     env = registry.make("test/host-counting")
     executor = RandomExecutor(env.spec.action_space)
-    played = evaluate(env, executor, jax.random.key(0), episodes, num_workers=0)
+    heard = []
+    played = evaluate(env, executor, jax.random.key(0), episodes, num_workers=0, say=heard.append)
+    assert heard[0] == 0 and sorted(set(heard)) == heard and heard[-1] < episodes
     assert len(played.score) == len(set(played.score)) == episodes
     assert_array_equal(played.length, np.where(played.score % 2 == 0, 5, 7))
 

@@ -5,12 +5,15 @@ import json
 import os
 import sys
 from argparse import ArgumentParser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from mabl.errors import UserError, unknown_name
@@ -195,9 +198,9 @@ def evaluate(arguments: list[str]) -> int:
 
     use_compilation_cache()
     env, executor, subject = player(given)
-    results = run_episodes(
-        env, executor, jax.random.key(given.seed), given.episodes, given.num_workers
-    )
+    key = jax.random.key(given.seed)
+    with progress_bar("playing", given.episodes) as say:
+        results = run_episodes(env, executor, key, given.episodes, given.num_workers, say=say)
     numbers = {"env": env.spec.name, **subject, **summary(results, env.spec)}
     if given.json:
         print(json.dumps(numbers))
@@ -297,6 +300,15 @@ def list_algos(arguments: list[str]) -> None:
         marks = ("yes" if getattr(entry, column.field) else "no" for column in COLUMNS)
         table.add_row(name, *marks, entry.description)
     print_table(table)
+
+
+@contextmanager
+def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on the terminal while something goes on; tell it how much is done."""
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda done: progress.update(task, completed=done)
 
 
 def shallow(config: Any) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Playing whole episodes with fixed policies, and summing them up."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -41,18 +42,28 @@ def evaluate(
     episodes: int,
     num_workers: int | None = None,
     worker_timeout: float = 60.0,
+    say: Callable[[int], object] = lambda played: None,
 ) -> Results:
-    """Play `episodes` independent episodes to their ends; with workers if the environment needs."""
+    """Play `episodes` independent episodes to their ends; with workers if the environment needs.
+
+    `say` hears, batch by batch, how many were played so far.
+    """
     if not isinstance(env, Hosted):
-        return _play_compiled(env, executor, key, episodes)
+        return _play_compiled(env, executor, key, episodes, say)
     pool = open_pool(env, min(episodes, HOSTED_PARALLEL), num_workers, worker_timeout)
     try:
-        return _play_hosted(pool, env.spec, executor, key, episodes)
+        return _play_hosted(pool, env.spec, executor, key, episodes, say)
     finally:
         pool.close()
 
 
-def _play_compiled(env: CompiledEnv, executor: Executor, key: PRNGKey, episodes: int) -> Results:
+def _play_compiled(
+    env: CompiledEnv,
+    executor: Executor,
+    key: PRNGKey,
+    episodes: int,
+    say: Callable[[int], object],
+) -> Results:
     @eqx.filter_jit
     def play(executor: Executor, keys: Array) -> Results:
         def one(key: PRNGKey) -> Results:
@@ -67,12 +78,20 @@ def _play_compiled(env: CompiledEnv, executor: Executor, key: PRNGKey, episodes:
 
     batches = -(-episodes // PARALLEL)
     keys = jax.random.split(key, (batches, min(episodes, PARALLEL)))
-    played = [jax.device_get(play(executor, batch)) for batch in keys]
+    played: list[Results] = []
+    for batch in keys:
+        played.append(jax.device_get(play(executor, batch)))
+        say(min(episodes, len(played) * len(batch)))
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:episodes], *played)
 
 
 def _play_hosted(
-    pool: Pool, spec: EnvSpec, executor: Executor, key: PRNGKey, episodes: int
+    pool: Pool,
+    spec: EnvSpec,
+    executor: Executor,
+    key: PRNGKey,
+    episodes: int,
+    say: Callable[[int], object],
 ) -> Results:
     key, key_start = jax.random.split(key)
     n_envs = len(pool.slots.command)
@@ -86,7 +105,8 @@ def _play_hosted(
         return jax.vmap(partial(act_where, executor))(*of_envs)
 
     played: list[Results] = []
-    while sum(len(batch.length) for batch in played) < episodes:
+    while (n := sum(len(batch.length) for batch in played)) < episodes:
+        say(n)
         key, key_batch = jax.random.split(key)
         keys = jax.random.split(key_batch, n_envs)
         landed = rollouts.collect(
