@@ -26,8 +26,6 @@ from mabl.envs.pool import RESET, STEP
 from mabl.envs.workers import open_pool
 from mabl.rows import is_last
 
-N_ENVS = 4
-"""Environments of the worker."""
 Steps = Callable[[int], None]
 """Takes so many joint steps."""
 
@@ -109,9 +107,9 @@ def adapted(hosted: Hosted) -> Steps:
     return steps
 
 
-def in_worker(hosted: Hosted) -> Steps:
-    """Rows of a worker process."""
-    pool = open_pool(hosted, N_ENVS, 1)
+def in_worker(hosted: Hosted, n_envs: int) -> Steps:
+    """Rows of a worker process with several environments."""
+    pool = open_pool(hosted, n_envs, 1)
     drawn = actions_of(hosted, 1_000)
 
     def tell(command: Any) -> None:
@@ -121,7 +119,7 @@ def in_worker(hosted: Hosted) -> Steps:
 
     def steps(n: int) -> None:
         tell(RESET)
-        for k in range(n // N_ENVS):
+        for k in range(n // n_envs):
             over = is_last(pool.slots.rows)
             pool.slots.seed[:] = k
             pool.slots.action[:] = drawn[k % 1_000]
@@ -165,15 +163,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--steps", type=int, default=2_000)
+    parser.add_argument("--envs", type=int, default=8, help="of the worker")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     for case in cases():
         hosted = registry.make(case.env)
         assert isinstance(hosted, Hosted)
         kinds = {name: make(hosted) for name, make in case.bare.items()}
-        kinds |= {"adapted": adapted(hosted), "worker": in_worker(hosted)}
+        kinds |= {"adapted": adapted(hosted), "worker": in_worker(hosted, args.envs)}
         for steps in kinds.values():
-            steps(N_ENVS)
+            steps(args.envs)
         rounds = [
             {name: rate(steps, args.steps) for name, steps in kinds.items()}
             for _ in range(args.rounds)
