@@ -17,18 +17,21 @@ from mabl.execution import (
     act_alone,
     executor_of,
 )
+from mabl.nets.categorical import CodeShape
 from mabl.rows import TimeStep
 from mabl.world_models.levels import AgentFilter, Level
 
 SPACE = Discrete(4)
+LATENT = CodeShape(3, 4)
 N_AGENTS, OBS, STEPS = 3, 5, 4
 
 
 def build(greedy: bool = False, out_scale: float = 3.0) -> LocalExecutor:
     """Three categoricals of four classes, h of 16."""
     key_filter, key_actor = jax.random.split(jax.random.key(0))
-    agent = AgentFilter(OBS, 4, 16, 3, 4, key_filter)
-    return executor_of(Policy(agent, Actor(12 + 16, 4, 16, 1, out_scale, key_actor)), SPACE, greedy)
+    agent = AgentFilter(OBS, 4, 16, LATENT, key_filter)
+    actor = Actor((LATENT, 16), 4, 16, 1, out_scale, key_actor)
+    return executor_of(Policy(agent, actor), SPACE, greedy)
 
 
 def some_rows(seed: int = 0) -> TimeStep:
@@ -83,7 +86,7 @@ def test_an_agent_depends_on_nothing_but_its_own_observations_and_actions(agent,
     changed_latents, changed_actions = play(executor, change_teammates(rows, agent))
     assert_array_equal(actions[:, agent], changed_actions[:, agent])
     assert_array_equal(latents.h[:, agent], changed_latents.h[:, agent])
-    assert_array_equal(latents.z[:, agent], changed_latents.z[:, agent])
+    assert_array_equal(latents.z.index[:, agent], changed_latents.z.index[:, agent])
     # The teammates, meanwhile, live in another world: the change did arrive.
     for other in set(range(N_AGENTS)) - {agent}:
         assert (latents.h[:, other] != changed_latents.h[:, other]).any()
@@ -94,9 +97,9 @@ def test_an_agent_does_depend_on_its_own_observation():
     executor, rows = build(), some_rows()
     latents, _ = play(executor, rows)
     changed, _ = play(executor, rows._replace(obs=rows.obs.at[0, 0].add(9.0)))
-    assert (latents.z[0, 0] != changed.z[0, 0]).any()
+    assert (latents.z.index[0, 0] != changed.z.index[0, 0]).any()
     assert (latents.h[1, 0] != changed.h[1, 0]).any()  # remembered one step later
-    assert_array_equal(latents.z[:, 1:], changed.z[:, 1:])
+    assert_array_equal(latents.z.index[:, 1:], changed.z.index[:, 1:])
 
 
 def test_an_agent_remembers_its_own_previous_action():
@@ -120,7 +123,7 @@ def test_an_agent_alone_acts_as_it_does_in_the_team():
         level, action = act_alone(
             executor.policy,
             SPACE,
-            Level(memory.h[i], memory.z[i]),
+            jax.tree.map(lambda x, i=i: x[i], memory),
             row.prev_action[i],
             row.obs[i],
             row.available[i],
@@ -129,7 +132,7 @@ def test_an_agent_alone_acts_as_it_does_in_the_team():
             False,
         )
         assert action == actions[i]
-        assert_array_equal(level.z, team.z[i])
+        assert_array_equal(level.z.index, team.z.index[i])
         assert_allclose(level.h, team.h[i], rtol=1e-5, atol=1e-6)
 
 
@@ -139,7 +142,7 @@ def test_agents_in_equal_positions_draw_their_own_samples():
     row = row._replace(obs=jnp.broadcast_to(row.obs[:1], row.obs.shape))
     keys = jax.random.split(jax.random.key(0), 50)
     memory, _ = jax.vmap(lambda key: executor.act(executor.initial(row), row, key))(keys)
-    assert (memory.z[:, 0] != memory.z[:, 1]).any()
+    assert (memory.z.index[:, 0] != memory.z.index[:, 1]).any()
 
 
 @eqx.filter_jit
@@ -222,7 +225,7 @@ def test_a_first_row_forgets_the_past_and_ignores_the_action_before():
 def test_execution_starts_from_zeros_for_every_agent():
     level = build().initial(jax.tree.map(lambda x: x[0], some_rows()))
     assert_array_equal(level.h, np.zeros((N_AGENTS, 16)))
-    assert_array_equal(level.z, np.zeros((N_AGENTS, 12)))
+    assert_array_equal(level.z.onehot(), np.zeros((N_AGENTS, 12)))
 
 
 # --- centralised execution --------------------------------------------------------------------

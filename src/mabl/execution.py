@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.behaviour.base import ActorFunction
 from mabl.envs.base import ActionSpace, Discrete
+from mabl.nets.mlp import Features
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.levels import forget, team_of
@@ -49,7 +50,7 @@ class LocalFilter(Protocol[M]):
         """One step; the caller resets `memory` and `prev_action` at a first row."""
         ...
 
-    def features(self, memory: M) -> Float[Array, " F"]:
+    def features(self, memory: M) -> Features:
         """What the policy sees of it."""
         ...
 
@@ -78,7 +79,7 @@ class JointFilter(Protocol[M]):
         """One step of all; the caller resets `memory` and `prev_action` at a first row."""
         ...
 
-    def features(self, memory: M) -> Float[Array, "N F"]:
+    def features(self, memory: M) -> Features:
         """What each agent's policy sees of it."""
         ...
 

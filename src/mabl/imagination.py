@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float
 from mabl.behaviour.base import ActorFunction
 from mabl.envs.base import ActionSpace, Discrete
 from mabl.errors import require_between, require_positive
+from mabl.nets.categorical import still
+from mabl.nets.mlp import Features
 from mabl.types import PRNGKey, TeamView, Trajectory
 from mabl.world_models.base import WorldModel
 from mabl.world_models.heads import Predictions
@@ -52,7 +54,7 @@ class Dream(NamedTuple):
     actor: ActorFunction
     action_space: ActionSpace
     config: ImaginationConfig
-    critic_features: Callable[[Any], Float[Array, "N G"]]
+    critic_features: Callable[[Any], Features]
     """Of a latent, what only training sees."""
 
     def act(self, state: Imagined, key: PRNGKey) -> tuple[Array, Float[Array, " N"]]:
@@ -112,6 +114,7 @@ def imagine_trajectory(
         return after, (dream.view(state), action, log_prob, predicted.reward, continues)
 
     keys = jax.random.split(key, dream.config.horizon - 1)
+    start = still(start)
     last, (view, action, log_prob, reward, continues) = jax.lax.scan(advance, start, keys)
     view = jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), view, dream.view(last))
     survived = jnp.concatenate([jnp.ones_like(continues[:1]), continues[:-1]])

@@ -16,9 +16,10 @@ PRNGKey = Key[Array, ""]
 class TeamView(NamedTuple):
     """What learning to act sees of a latent."""
 
-    actor_features: Float[Array, "*b N F"]
-    """What each agent's policy sees: in execution, too."""
-    critic_features: Float[Array, "*b N G"]
+    actor_features: Any
+    """`[*b, N, ...]`, in parts (`nets.mlp.Features`): what each agent's policy sees, in execution,
+    too."""
+    critic_features: Any
     """What only training sees: the input of the centralised critic, or of QMIX's mixer."""
     available: Bool[Array, "*b N A"]
     """Actions that may be taken."""

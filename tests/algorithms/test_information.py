@@ -15,6 +15,7 @@ from mabl.algorithms.base import Algorithm
 from mabl.algorithms.registry import ALGORITHMS, COLUMNS
 from mabl.envs.base import Discrete, EnvSpec
 from mabl.execution import executor_of
+from mabl.nets.mlp import dense
 from mabl.rows import TimeStep
 from mabl.world_models.base import observe_sequence
 
@@ -78,7 +79,7 @@ def play(algo: str, rows: TimeStep) -> tuple[jax.Array, jax.Array]:
         features = policy.filter.features
         if ALGORITHMS[algo].decentralised:
             features = jax.vmap(features)
-        return (memory, action), (features(memory), action)
+        return (memory, action), (dense(features(memory)), action)
 
     first = jax.tree.map(lambda x: x[0], rows)
     carry = (executor.initial(first), first.prev_action)
@@ -93,7 +94,7 @@ def learned_from(algo: str, rows: TimeStep) -> jax.Array:
         return model_free.critic_features(rows)
     model = getattr(learner, "base", learner).model
     latents, _ = observe_sequence(model, rows, jax.random.key(2))
-    return jax.vmap(model.critic_features)(latents)
+    return dense(jax.vmap(model.critic_features)(latents))
 
 
 def acts_decentralised(algo: str) -> bool:

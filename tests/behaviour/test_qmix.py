@@ -63,7 +63,7 @@ def leaves(tree) -> list[np.ndarray]:
 
 
 def test_the_mixer_by_hand():
-    mixer = Mixer(n_agents=2, n_features=2, hidden=2, hypernet=2, key=jax.random.key(0))
+    mixer = Mixer(n_agents=2, seen=2, hidden=2, hypernet=2, key=jax.random.key(0))
     mixer = eqx.tree_at(
         lambda m: [
             m.weight_in.layers[0].weight,
@@ -475,10 +475,11 @@ def test_learning_in_imagination_leaves_the_world_model_alone():
     # The mixer sees the global samples of the team, the agents' values their own levels.
     values, model = learner.behaviour.values, learner.model
     latent = model.initial()
-    global_size = training.algorithm.behaviour.critic_features(model, latent).size
-    assert values.mixer.weight_in.layers[0].weight.shape[0] == global_size
-    assert global_size == latent.global_.z.size
-    assert values.q.layers[0].weight.shape[0] == model.actor_features(latent).shape[-1]
+    team = training.algorithm.behaviour.critic_features(model, latent).ravel()
+    assert values.mixer.weight_in.layers[0].weight.shape[:-1] == team.shape
+    assert team.shape == (latent.global_.z.index.size, latent.global_.z.n_classes)
+    own = tuple(block.shape[:-1] for block in values.q.layers[0].weight)
+    assert own == (latent.agent.z.shape, latent.agent.h.shape[-1:])
 
 
 def test_a_model_without_global_latents_is_refused():

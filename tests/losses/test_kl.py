@@ -97,6 +97,71 @@ def test_below_the_free_nats_nothing_is_trained():
         assert_array_equal(gradient, [[0.0, 0.0]])
 
 
+def by_definition(posterior, prior, prior_weight, posterior_weight, reduction, free_nats):
+    """`balanced_kl` as it is written in the paper, its gradients left to JAX."""
+    stop, reduce = jax.lax.stop_gradient, {"mean": jnp.mean, "sum": jnp.sum}[reduction]
+    train_prior = reduce(categorical_kl(stop(posterior), prior), axis=-1)
+    train_posterior = reduce(categorical_kl(posterior, stop(prior)), axis=-1)
+    return prior_weight * jnp.maximum(train_prior, free_nats) + posterior_weight * jnp.maximum(
+        train_posterior, free_nats
+    )
+
+
+@pytest.mark.parametrize("weights", [(0.8, 0.2), (0.5, 0.25), (1.0, 0.0), (0.0, 1.0)])
+@pytest.mark.parametrize(
+    ("reduction", "free_nats", "free"),
+    [
+        ("mean", 0.0, 0),
+        ("sum", 0.0, 0),
+        ("mean", 0.8, 14),  # of 20
+        ("sum", 2.4, 14),
+        ("mean", 100.0, 20),
+        ("sum", 100.0, 20),
+    ],
+)
+@pytest.mark.parametrize("way", ["leading axes", "vmaps"])
+def test_balanced_kl_and_its_gradients_are_those_of_its_definition(
+    weights, reduction, free_nats, free, way
+):
+    key_posterior, key_prior = jax.random.split(jax.random.key(0))
+    posterior = jax.random.normal(key_posterior, (4, 5, 3, 4))
+    prior = jax.random.normal(key_prior, (4, 5, 3, 4))
+    row_weights = jnp.linspace(-1, 2, 20).reshape(4, 5)
+
+    def computed(kl):
+        def one(posterior, prior):
+            return kl(posterior, prior, *weights, reduction, free_nats)
+
+        each = jax.vmap(jax.vmap(one)) if way == "vmaps" else one
+        gradients = jax.grad(lambda *x: (row_weights * each(*x)).sum(), argnums=(0, 1))
+        return jax.jit(each)(posterior, prior), jax.jit(gradients)(posterior, prior)
+
+    value, (to_posterior, to_prior) = computed(balanced_kl)
+    expected, (to_posterior_expected, to_prior_expected) = computed(by_definition)
+    assert jnp.isclose(expected, sum(weights) * free_nats, rtol=1e-6).sum() == free
+    assert_allclose(value, expected, rtol=1e-5)
+    assert_allclose(to_posterior, to_posterior_expected, rtol=1e-5, atol=1e-6)
+    assert_allclose(to_prior, to_prior_expected, rtol=1e-5, atol=1e-6)
+
+
+def test_balanced_kl_of_certain_categoricals_has_finite_gradients():
+    posterior, prior = jnp.array([[200.0, 0.0, 0.0]]), jnp.array([[0.0, 200.0, 0.0]])
+    to_posterior, to_prior = jax.grad(balanced_kl, (0, 1))(posterior, prior, 0.8, 0.2)
+    assert_array_equal(to_posterior, [[0.0, 0.0, 0.0]])
+    assert_allclose(to_prior, [[-0.8, 0.8, 0.0]], rtol=1e-5)
+
+
+def test_one_prior_for_several_posteriors_is_trained_by_all():
+    posteriors = jax.random.normal(jax.random.key(0), (5, 3, 4))
+    prior = jax.random.normal(jax.random.key(1), (3, 4))
+
+    def gradient(kl):
+        each = jax.vmap(lambda q, p: kl(q, p, 0.8, 0.2, "sum", 0.0), (0, None))
+        return jax.grad(lambda p: each(posteriors, p).sum())(prior)
+
+    assert_allclose(gradient(balanced_kl), gradient(by_definition), rtol=1e-5, atol=1e-6)
+
+
 def test_kl_gradient_agrees_with_finite_differences():
     def total(posterior, prior):
         return categorical_kl(jnp.asarray(posterior), jnp.asarray(prior)).sum()

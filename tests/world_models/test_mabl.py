@@ -12,6 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mabl.envs.base import Continuous, Discrete, EnvSpec
 from mabl.losses.kl import balanced_kl
+from mabl.nets.categorical import Code, CodeShape
+from mabl.nets.mlp import MLP, dense
 from mabl.rows import TimeStep
 from mabl.world_models.base import (
     WorldModelConfig,
@@ -21,7 +23,8 @@ from mabl.world_models.base import (
     observe_sequence,
     reward_loss,
 )
-from mabl.world_models.heads import Predictions
+from mabl.world_models.heads import Heads, Predictions
+from mabl.world_models.levels import Level
 from mabl.world_models.mabl import MABL
 
 SPEC = EnvSpec("stub", 3, 4, 5, Discrete(3), 10, "score")
@@ -200,7 +203,7 @@ def test_agent_level_of_the_posterior_sees_neither_state_nor_teammates(posterior
     (before, logits), (after, other_logits) = posterior_of(rows), posterior_of(other)
     for agent in (0, 2):
         assert_array_equal(before.agent.h[:, agent], after.agent.h[:, agent])
-        assert_array_equal(before.agent.z[:, agent], after.agent.z[:, agent])
+        assert_array_equal(before.agent.z.index[:, agent], after.agent.z.index[:, agent])
         assert_array_equal(logits["agent"][:, agent], other_logits["agent"][:, agent])
     # Positive controls: agent 0's global level sees what its agent level does not; of a
     # teammate's observation only the teammate's own levels know.
@@ -225,13 +228,19 @@ def test_global_posterior_sees_the_state_the_agents_own_sample_and_h(model):
     assert not np.allclose(logits["global"][:, 1], changed["global"][:, 1])
 
 
+def mirrored(level: Level) -> Level:
+    """The same with another state: the vector read backwards."""
+    z = level.z
+    return level._replace(z=Code(3 - z.index[:, ::-1], z.tilt, z.n_classes))
+
+
 def test_agent_prior_depends_on_the_sample_of_the_global_prior(model):
     latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
     one, other = (model.prior(latent, jax.random.key(seed))[1] for seed in (0, 1))
     assert_array_equal(one["global"], other["global"])
     assert not np.allclose(one["agent"], other["agent"])
     # The posterior sample is not an input of it ...
-    moved = latent._replace(global_=latent.global_._replace(z=latent.global_.z[:, ::-1]))
+    moved = latent._replace(global_=mirrored(latent.global_))
     assert_array_equal(model.prior(moved, jax.random.key(0))[1]["agent"], one["agent"])
 
 
@@ -240,14 +249,14 @@ def test_agent_prior_input_posterior_takes_the_posterior_sample_instead():
     latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
     one, other = (model.prior(latent, jax.random.key(seed))[1] for seed in (0, 1))
     assert_array_equal(one["agent"], other["agent"])
-    moved = latent._replace(global_=latent.global_._replace(z=latent.global_.z[:, ::-1]))
+    moved = latent._replace(global_=mirrored(latent.global_))
     assert not np.allclose(model.prior(moved, jax.random.key(0))[1]["agent"], one["agent"])
 
 
 def test_priors_do_not_see_the_row_they_predict(model):
     # The row's own z is not an input of either prior: only h, which precedes it.
     latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
-    moved = latent._replace(agent=latent.agent._replace(z=latent.agent.z[:, ::-1]))
+    moved = latent._replace(agent=mirrored(latent.agent))
     before, after = (model.prior(x, jax.random.key(0))[1] for x in (latent, moved))
     assert_array_equal(before["agent"], after["agent"])
     assert_array_equal(before["global"], after["global"])
@@ -262,7 +271,8 @@ def test_imagination_advances_both_embeddings_as_observation_does(model):
     assert_allclose(imagined.agent.h, latents.agent.h[1], rtol=1e-5, atol=1e-6)
     assert_allclose(imagined.global_.h, latents.global_.h[1], rtol=1e-5, atol=1e-6)
     for level in imagined:
-        assert_array_equal(level.z.reshape(3, 3, 4).sum(-1), 1.0)
+        assert_array_equal(level.z.onehot().reshape(3, 3, 4).sum(-1), 1.0)
+        assert level.z.tilt is None
 
 
 def test_imagined_agent_state_follows_the_imagined_global_state():
@@ -274,13 +284,16 @@ def test_imagined_agent_state_follows_the_imagined_global_state():
         last = lambda n: (n.mlp.layers[-1].weight, n.mlp.layers[-1].bias)  # noqa: E731
         return eqx.tree_at(last, net, (jnp.zeros_like(last(net)[0]), bias))
 
-    def copier(net):  # hidden unit k repeats input 16 + k, the sample of the global prior
+    def copier(net):  # hidden unit k repeats entry k of the sample of the global prior
         first, last = net.mlp.layers
+        of_h, of_sample = first.weight
+        assert of_sample.shape == (3, 4, 16)
         return eqx.tree_at(
-            lambda n: (n.mlp.layers[0].weight, n.mlp.layers[1].weight),
+            lambda n: (*n.mlp.layers[0].weight, n.mlp.layers[1].weight),
             net,
             (
-                jnp.zeros_like(first.weight).at[16 + jnp.arange(12), jnp.arange(12)].set(1.0),
+                jnp.zeros_like(of_h),
+                jnp.eye(12, 16).reshape(3, 4, 16),
                 jnp.zeros_like(last.weight).at[jnp.arange(12), jnp.arange(12)].set(big),
             ),
         )
@@ -293,7 +306,8 @@ def test_imagined_agent_state_follows_the_imagined_global_state():
             (constant(model.nets.global_prior, bias), copier(model.nets.agent_prior)),
         )
         z = rigged.imagine(rigged.initial(), jnp.zeros((3, 3)), jax.random.key(0)).agent.z
-        assert_array_equal(z.reshape(3, 3, 4).argmax(-1), np.full((3, 3), chosen))
+        assert_array_equal(z.onehot().reshape(3, 3, 4).argmax(-1), np.full((3, 3), chosen))
+        assert_array_equal(z.index, np.full((3, 3), chosen))
 
 
 def test_a_first_row_resets_both_levels(model):
@@ -320,19 +334,20 @@ def test_a_first_row_resets_both_levels(model):
 
 def test_features_are_the_agent_level_for_actors_and_both_levels_for_critics(model):
     latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
-    assert_array_equal(
-        model.actor_features(latent), np.concatenate([latent.agent.z, latent.agent.h], -1)
-    )
-    both = (latent.agent.z, latent.global_.z, latent.agent.h, latent.global_.h)
-    assert_array_equal(model.critic_features(latent), np.concatenate(both, -1))
-    assert_array_equal(model.global_features(latent), latent.global_.z)
+    z_agent, z_global = latent.agent.z.onehot(), latent.global_.z.onehot()
+    own = np.concatenate([z_agent, latent.agent.h], -1)
+    assert_array_equal(dense(model.actor_features(latent)), own)
+    both = (z_agent, z_global, latent.agent.h, latent.global_.h)
+    assert_array_equal(dense(model.critic_features(latent)), np.concatenate(both, -1))
+    assert_array_equal(dense(model.global_features(latent)), z_global)
 
 
 def test_a_team_starts_from_zeros_at_both_levels_and_acts_by_its_filter(model):
     start = model.initial()
     for level in start:
         assert_array_equal(level.h, np.zeros((3, 16)))
-        assert_array_equal(level.z, np.zeros((3, 12)))
+        assert_array_equal(level.z.onehot(), np.zeros((3, 12)))
+        assert_array_equal(level.z.tilt, np.zeros((3, 3, 4)))  # to train
     assert model.filter is model.nets.filter
 
 
@@ -340,6 +355,82 @@ def test_nothing_is_dropped_in_training(model):
     rows, key = some_rows(3), jax.random.key(1)
     both = (observe_sequence(model, rows, key, train) for train in (False, True))
     jax.tree.map(assert_array_equal, *both)
+
+
+# --- The decoders' first layers ----------------------------------------------------------------
+
+
+AGENT, FULL = ("obs", "agent_reward"), ("terminated", "available", "action", "full_reward")
+OWN, BOTH = (CodeShape(3, 4), 5), (CodeShape(3, 4), CodeShape(3, 4), 5, 5)
+
+
+def some_heads(n_hidden: int, both_levels_reward: bool) -> Heads:
+    return Heads(OWN, BOTH, 6, 3, 8, n_hidden, both_levels_reward, jax.random.key(0))
+
+
+def seen() -> tuple:
+    """What decoders see of some latents: of the agent's own level, and of both."""
+    one, other = Code(jnp.array([1, 0, 3]), None, 4), Code(jnp.array([2, 2, 0]), None, 4)
+    h, g = jnp.linspace(-1, 1, 5), jnp.linspace(2, 0, 5)
+    return (one, h), (one, other, h, g)
+
+
+@pytest.mark.parametrize("both_levels_reward", [False, True])
+@pytest.mark.parametrize("n_hidden", [1, 2])
+def test_decoders_with_merged_first_layers_are_networks_of_their_own(n_hidden, both_levels_reward):
+    agent, full = seen()
+    keys = jax.random.split(jax.random.key(0), 6)
+    expected = {
+        name: MLP(width, n, 8, n_hidden, key)(x)
+        for name, width, n, key, x in (
+            ("obs", 17, 6, keys[0], dense(agent)),
+            ("agent_reward", 17, 1, keys[1], dense(agent)),
+            ("terminated", 34, 1, keys[2], dense(full)),
+            ("available", 34, 4, keys[3], dense(full)),
+            ("action", 34, 3, keys[4], dense(full)),
+            ("full_reward", 34, 1, keys[5], dense(full)),
+        )
+    }
+    predicted = some_heads(n_hidden, both_levels_reward)(agent, full)
+    close = {"rtol": 1e-5, "atol": 1e-6}
+    for name in ("obs", "action"):
+        assert_allclose(getattr(predicted, name), expected[name], **close, err_msg=name)
+    assert_allclose(predicted.terminated, expected["terminated"][0], **close)
+    assert_allclose(predicted.available, expected["available"][:3], **close)
+    assert_allclose(predicted.alive, expected["available"][3], **close)
+    if both_levels_reward:
+        assert_allclose(predicted.reward, expected["full_reward"][0], **close)
+        assert_allclose(predicted.agent_reward, expected["agent_reward"][0], **close)
+    else:
+        assert_allclose(predicted.reward, expected["agent_reward"][0], **close)
+        assert predicted.agent_reward is None
+
+
+@pytest.mark.parametrize(
+    ("output", "decoder"),
+    [
+        ("obs", "obs"),
+        ("agent_reward", "agent_reward"),
+        ("terminated", "terminated"),
+        ("available", "available"),
+        ("alive", "available"),
+        ("action", "action"),
+        ("reward", "full_reward"),
+    ],
+)
+def test_a_prediction_trains_its_decoder_alone(output, decoder):
+    agent, full = seen()
+    gradient = eqx.filter_grad(lambda heads: (getattr(heads(agent, full), output) ** 2).sum())(
+        some_heads(1, True)
+    )
+
+    def trained(tree) -> bool:
+        return max(float(jnp.abs(x).max()) for x in jax.tree.leaves(tree)) > 0
+
+    for merged, names in ((gradient.agent_in, AGENT), (gradient.full_in, FULL)):
+        for i, name in enumerate(names):
+            first = jax.tree.map(lambda x, i=i: x[..., 8 * i : 8 * (i + 1)], merged)
+            assert trained(first) == trained(getattr(gradient, name)) == (name == decoder), name
 
 
 # --- model_loss -------------------------------------------------------------------------------
@@ -556,14 +647,49 @@ class Studious(Rigged):
 
 def test_the_loss_alone_observes_to_train():
     model, rows, key = Studious(3), some_rows(2), jax.random.key(0)
+    time_first = jax.tree.map(lambda x: x[:, None], rows)
     for train in (False, True):
         assert (observe_sequence(model, rows, key, train)[0] == train).all()
-        assert (observe_batch(model, batched(rows), key, train).latents == train).all()
+        assert (observe_batch(model, time_first, key, train).latents == train).all()
     assert not observe_sequence(model, rows, key)[0].any()
-    assert not observe_batch(model, batched(rows), key).latents.any()
+    assert not observe_batch(model, time_first, key).latents.any()
     # All alive: log(1 + 1/e) at logit 1.
     _, metrics = model_loss(model, batched(rows), key, CONFIG, SPEC.action_space)
     assert_allclose(metrics["world_model/loss_alive"], np.log1p(1 / np.e), rtol=1e-5)
+
+
+class Counting(Rigged):
+    """Its latent is how many rows there were."""
+
+    def observe(self, latent, inputs, key, train=False):
+        logits = super().observe(latent, inputs, key)[1]
+        return latent + 1.0, logits
+
+
+def test_batches_are_observed_time_first():
+    rows = jax.tree.map(lambda x: jnp.stack([x] * 4, axis=1), some_rows(2))
+    seen = observe_batch(Counting(3), rows, jax.random.key(0))
+    assert_array_equal(seen.latents, [[[1] * 3] * 4, [[2] * 3] * 4])
+    assert_array_equal(seen.prior_latents, np.ones((2, 4, 3)))
+    assert seen.posterior["level"].shape == seen.prior["level"].shape == (2, 4, 3, 2, 2)
+
+
+def test_a_batch_is_observed_as_its_sequences_are(model):
+    # Every row is a first one, so that the agent level's logits do not depend on what is drawn.
+    sequences = [some_rows(3, first=(0, 1, 2), seed=seed) for seed in (0, 1)]
+    rows = jax.tree.map(lambda *x: jnp.stack(x, axis=1), *sequences)
+    logits = jax.jit(observe_batch)(model, rows, jax.random.key(0)).posterior["agent"]
+    for i, sequence in enumerate(sequences):
+        alone = jax.jit(observe_sequence)(model, sequence, jax.random.key(1))[1]["agent"]
+        assert_allclose(logits[:, i], alone, rtol=1e-5, atol=1e-6)
+
+
+def test_the_loss_takes_sequences_batch_first():
+    rows = jax.tree.map(lambda x: jnp.stack([x] * 4), some_rows(2))
+    _, metrics = model_loss(Counting(3), rows, jax.random.key(0), CONFIG, SPEC.action_space)
+    # All alive: log(1 + 1/e) at logit 1 in the first rows, log(1 + 1/e^2) at logit 2 in the second.
+    expected = (np.log1p(np.exp(-1)) + np.log1p(np.exp(-2))) / 2
+    assert_allclose(metrics["world_model/loss_alive"], expected, rtol=1e-5)
 
 
 def test_continuous_actions_are_regressed():

@@ -22,7 +22,7 @@ from mabl.envs.base import Discrete, EnvSpec
 from mabl.errors import UserError
 from mabl.imagination import Dream, ImaginationConfig, Imagined
 from mabl.losses.kl import categorical_kl
-from mabl.nets.mlp import MLP
+from mabl.nets.mlp import MLP, dense
 from mabl.replay import sample_sequences
 from mabl.rows import TimeStep
 from mabl.training.programs import build as build_training
@@ -116,6 +116,11 @@ def imagined(model: Any, latent: Any, action: Array, seed: Array = SEED) -> Any:
     return model.imagine(latent, SPEC.action_space.encode(action), jax.random.key(seed))
 
 
+def vector(features: Callable, latent: Any) -> np.ndarray:
+    """What is shown of a latent, as one array."""
+    return on_host(lambda latent: dense(features(latent)))(latent)
+
+
 def levels(latent: Any) -> list[Level]:
     """All levels of a latent, whatever it is made of."""
     parts = jax.tree.leaves(latent, is_leaf=lambda x: isinstance(x, Level))
@@ -126,9 +131,11 @@ def at(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda x: x[index], tree)
 
 
-def flipped(level: Level) -> Level:
-    """Another sample."""
-    return level._replace(z=level.z[..., ::-1])
+def flipped(level: Level, agents: Any = ...) -> Level:
+    """Another sample, of some agents: the vector of zeros and ones backwards."""
+    index = np.array(level.z.index)
+    index[agents] = level.z.n_classes - 1 - index[agents][..., ::-1]
+    return eqx.tree_at(lambda level: level.z.index, level, index)
 
 
 def assert_same(a: Any, b: Any) -> None:
@@ -223,11 +230,11 @@ def test_all_samples_are_one_hot_vectors_and_keep_their_embedding(model):
     after = imagined(model, at(seen.latents, 3), rows.prev_action[1])
     for latent in (seen.latents, seen.prior_latents, after):
         for level in levels(latent):
-            z = np.asarray(level.z).reshape(-1, 3, 4)
+            z = np.asarray(level.z.onehot()).reshape(-1, 3, 4)
             assert_array_equal(np.sort(z, axis=-1), np.broadcast_to([0, 0, 0, 1], z.shape))
     for before, prior in zip(levels(seen.latents), levels(seen.prior_latents), strict=True):
         assert_array_equal(before.h, prior.h)
-        assert (before.z != prior.z).any()
+        assert (before.z.index != prior.z.index).any()
 
 
 def test_posterior_samples_follow_their_logits(model):
@@ -235,21 +242,31 @@ def test_posterior_samples_follow_their_logits(model):
     seen = observed(sharp(model, 1e4), some_rows(4))
     assert len(seen.posterior) == len(levels(seen.latents))
     for logits, level in zip(seen.posterior.values(), levels(seen.latents), strict=True):
-        sample = level.z.reshape(logits.shape).argmax(-1)
         gap = np.diff(np.sort(np.asarray(logits), axis=-1)[..., -2:])[..., 0]
         clear = gap > 30
         assert clear.mean() > 0.5
-        assert_array_equal(sample[clear], logits.argmax(-1)[clear])
+        assert_array_equal(level.z.index[clear], logits.argmax(-1)[clear])
 
 
 # --- which term of the loss trains which part -------------------------------------------------
 
 
-def part_of(path: tuple) -> str:
-    """Such as `filter.encoder`, `agent_prior` or `heads.obs`."""
+MERGED = {
+    "agent_in": ("obs", "agent_reward"),
+    "full_in": ("terminated", "available", "action", "full_reward"),
+}
+"""First layers of several heads, side by side."""
+
+
+def parts_of(path: tuple, leaf: np.ndarray) -> dict[str, np.ndarray]:
+    """Whose it is, such as `filter.encoder`, `agent_prior` or `heads.obs`; columns of several."""
     names = jax.tree_util.keystr(path, simple=True, separator=".").split(".")
     names = [name for name in names if name not in ("nets", "team", "decoders")]
-    return ".".join(names[:2] if names[0] in ("filter", "heads") else names[:1])
+    if names[0] == "heads" and names[1] in MERGED:
+        columns = np.split(leaf, leaf.shape[-1] // CONFIG.hidden, axis=-1)
+        heads = MERGED[names[1]][: len(columns)]  # the last is not in all
+        return {f"heads.{head}": own for head, own in zip(heads, columns, strict=True)}
+    return {".".join(names[:2] if names[0] in ("filter", "heads") else names[:1]): leaf}
 
 
 @eqx.filter_jit
@@ -257,7 +274,7 @@ def jacobian(model: Any, rows: TimeStep, config: WorldModelConfig) -> dict[str, 
     """The gradient of each term of the loss."""
 
     def terms(model: Any) -> dict[str, Array]:
-        batch = jax.tree.map(lambda x: x[None], rows)
+        batch = jax.tree.map(lambda x: x[:, None], rows)
         seen = observe_batch(model, batch, jax.random.key(1))
         predicted = jax.vmap(jax.vmap(model.predict))(seen.latents)
         losses = decoder_losses(predicted, batch, config, SPEC.action_space)
@@ -273,9 +290,10 @@ def reached(name: str, first: tuple[int, ...] = (0,), **options) -> dict[str, se
     gradients = jax.device_get(jacobian(build(name, **options), some_rows(3, first), config))
     return {
         term: {
-            part_of(path)
+            part
             for path, leaf in jax.tree_util.tree_leaves_with_path(gradient)
-            if np.abs(leaf).max() > 0
+            for part, own in parts_of(path, leaf).items()
+            if np.abs(own).max() > 0
         }
         for term, gradient in gradients.items()
     }
@@ -384,7 +402,7 @@ def test_nothing_in_dreamer_sees_the_state_or_teammates(what):
 def test_nothing_in_dreamers_imagination_sees_teammates():
     model, rows = build("dreamer-v2"), some_rows(4)
     latent = at(observed(model, rows).latents, 1)
-    moved = put(put(latent, "h", 1, lambda x: x + 1), "z", 1, lambda x: x[::-1].copy())
+    moved = flipped(put(latent, "h", 1, lambda x: x + 1), 1)
     action = np.array([0, 1, 2])
     before, after = imagined(model, latent, action), imagined(model, moved, np.array([0, 2, 2]))
     others = np.array([0, 2])
@@ -395,9 +413,9 @@ def test_nothing_in_dreamers_imagination_sees_teammates():
 def test_dreamers_actors_and_critics_see_the_agents_own_level():
     model = build("dreamer-v2")
     latent = at(observed(model, some_rows(4)).latents, 0)
-    own = np.concatenate([latent.z, latent.h], -1)
-    assert_array_equal(on_host(model.actor_features)(latent), own)
-    assert_array_equal(on_host(model.critic_features)(latent), own)
+    own = np.concatenate([latent.z.onehot(), latent.h], -1)
+    assert_array_equal(vector(model.actor_features, latent), own)
+    assert_array_equal(vector(model.critic_features, latent), own)
 
 
 # --- MABL-SG ----------------------------------------------------------------------------------
@@ -406,8 +424,8 @@ def test_dreamers_actors_and_critics_see_the_agents_own_level():
 def test_sg_has_one_global_latent_without_an_axis_of_agents():
     seen = observed(build("mabl-sg"), some_rows(4))
     for latents in (seen.latents, seen.prior_latents):
-        assert latents.agent.h.shape == (4, 3, 8) and latents.agent.z.shape == (4, 3, 12)
-        assert latents.global_.h.shape == (4, 8) and latents.global_.z.shape == (4, 12)
+        assert latents.agent.h.shape == (4, 3, 8) and latents.agent.z.onehot().shape == (4, 3, 12)
+        assert latents.global_.h.shape == (4, 8) and latents.global_.z.onehot().shape == (4, 12)
     for logits in (seen.posterior, seen.prior):
         assert logits["agent"].shape == (4, 3, 3, 4) and logits["global"].shape == (4, 3, 4)
 
@@ -478,12 +496,13 @@ def test_sgs_imagined_agents_follow_the_one_imagined_global_state():
 
     def copier(net):  # hidden units are too few for all 12 inputs: the first 8 pass
         first, last = net.mlp.layers
+        of_h, of_z = first.weight
         unit = jnp.arange(8)
         return eqx.tree_at(
             lambda n: (n.mlp.layers[0].weight, n.mlp.layers[1].weight),
             net,
             (
-                jnp.zeros_like(first.weight).at[8 + unit, unit].set(1.0),
+                (jnp.zeros_like(of_h), jnp.eye(12, 8).reshape(of_z.shape)),
                 jnp.zeros_like(last.weight).at[unit, unit].set(50.0),
             ),
         )
@@ -492,8 +511,8 @@ def test_sgs_imagined_agents_follow_the_one_imagined_global_state():
     initial, seen = jax.device_get(model.initial()), set()
     for seed in range(4):
         latent = imagined(rigged, initial, np.zeros(3, int), np.int32(seed))
-        team = latent.global_.z.reshape(3, 4)[:2].argmax(-1)
-        assert_array_equal(latent.agent.z.reshape(3, 3, 4)[:, :2].argmax(-1), [team] * 3)
+        team = latent.global_.z.index[:2]
+        assert_array_equal(latent.agent.z.index[:, :2], [team] * 3)
         seen.add(tuple(np.asarray(team)))
     assert len(seen) > 1
 
@@ -501,13 +520,14 @@ def test_sgs_imagined_agents_follow_the_one_imagined_global_state():
 def test_sgs_actors_see_their_own_level_critics_the_teams_too_and_mixers_the_teams_sample():
     model = build("mabl-sg")
     latent = at(observed(model, some_rows(4)).latents, 0)
-    own = np.concatenate([latent.agent.z, latent.agent.h], -1)
-    team = np.concatenate([latent.global_.z, latent.global_.h])
-    assert_array_equal(on_host(model.actor_features)(latent), own)
-    assert_array_equal(
-        on_host(model.critic_features)(latent), np.concatenate([own, np.stack([team] * 3)], -1)
-    )
-    assert_array_equal(on_host(model.global_features)(latent), np.stack([latent.global_.z] * 3))
+    (h, z), (team_h, team_z) = ((level.h, level.z.onehot()) for level in latent)
+    team_h, team_z = np.stack([team_h] * 3), np.stack([team_z] * 3)
+    for seen, parts in (
+        (model.actor_features, [z, h]),
+        (model.critic_features, [z, team_z, h, team_h]),
+        (model.global_features, [team_z]),
+    ):
+        assert_array_equal(vector(seen, latent), np.concatenate(parts, -1))
 
 
 # --- MAMBA and MAG ----------------------------------------------------------------------------
@@ -528,7 +548,8 @@ def test_a_teammates_observation_is_heard_at_the_next_row(decided):
     rows = some_rows(4)
     before = observed(decided, rows)
     after = observed(decided, changed_rows(rows, "teammate's obs", 1))
-    assert (before.latents.level.z[1, 1] != after.latents.level.z[1, 1]).any()  # it draws anew
+    one, other = (seen.latents.level.z.index[1, 1] for seen in (before, after))
+    assert (one != other).any()  # it draws anew
     for agent in (0, 2):
         assert_same(
             at(before.latents.level, np.s_[:2, agent]), at(after.latents.level, np.s_[:2, agent])
@@ -557,7 +578,7 @@ def test_who_is_dead_at_a_row_is_not_heard_from_then_on(decided):
         """With another teammate's observation at row 1 and action from there to row 2."""
         other = changed_rows(changed_rows(rows, "teammate's obs", 1), "teammate's action", 2)
         before, after = observed(decided, rows), observed(decided, other)
-        assert (before.latents.level.z[1, 1] != after.latents.level.z[1, 1]).any()
+        assert (before.latents.level.z.index[1, 1] != after.latents.level.z.index[1, 1]).any()
         assert differ(before.latents.level.h[2, 1], after.latents.level.h[2, 1])  # to itself
         return before, after
 
@@ -582,8 +603,8 @@ def living(model: MAMBA, logit: Array) -> MAMBA:
 
 def hears(model: MAMBA, latent: Any, teammate: int) -> np.ndarray:
     """Who, in the next imagined row, is another when a teammate's sample and action are."""
-    level, action = latent.level, np.array([0, 1, 2])
-    said = latent._replace(level=put(level, "z", teammate, lambda x: x[::-1].copy()))
+    action = np.array([0, 1, 2])
+    said = latent._replace(level=flipped(latent.level, teammate))
     before = imagined(model, latent, action)
     after = imagined(model, said, np.where(np.arange(3) == teammate, (action + 1) % 3, action))
     return np.asarray((before.level.h != after.level.h).any(-1))
@@ -645,11 +666,11 @@ def test_execution_is_the_posterior_without_dropout(talking):
         row = at(rows, t)
         memory = joint(memory, row, key_t)
         assert_allclose(memory.level.h, latents.level.h[t], rtol=1e-5, atol=1e-6)
-        assert_array_equal(memory.level.z, latents.level.z[t])
+        assert_array_equal(memory.level.z.index, latents.level.z.index[t])
         assert_array_equal(memory.alive, row.alive)
-        own = np.concatenate([memory.level.z, memory.level.h], -1)
+        own = np.concatenate([memory.level.z.onehot(), memory.level.h], -1)
         for seen in (talking.filter.features, talking.actor_features, talking.critic_features):
-            assert_array_equal(on_host(seen)(memory), own)
+            assert_array_equal(vector(seen, memory), own)
 
 
 def test_only_without_sharing_every_parameter_has_an_axis_of_agents():
@@ -684,7 +705,7 @@ def test_in_mag_an_agents_parameters_are_its_own_and_teammates_are_heard_all_the
     # Observing, likewise, in the first row; in the second its other sample is heard.
     before, after = observed(model, some_rows(4)), observed(other, some_rows(4))
     assert_same(at(of_agent(before, others), np.s_[:1]), at(of_agent(after, others), np.s_[:1]))
-    assert (before.latents.level.z[0, 1] != after.latents.level.z[0, 1]).any()
+    assert (before.latents.level.z.index[0, 1] != after.latents.level.z.index[0, 1]).any()
     assert differ(before.latents.level.h[1, 0], after.latents.level.h[1, 0])
     assert_array_equal(hears(model, start, 1), [True] * 3)
 
@@ -822,6 +843,7 @@ def mag():
         rows = sample_sequences(
             experience.replay, key_sample, config.batch_size, config.batch_length
         )
+        rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)
         model = after.base.model
         seen = observe_batch(model, rows, key_observe)
         predicted = jax.vmap(jax.vmap(model.predict))(seen.latents)
@@ -876,7 +898,7 @@ def test_the_predicted_error_is_the_models_loss_at_each_row_of_each_agent(mag):
     _, metrics, losses, foretold = jax.device_get(
         learn(learner._replace(error=error), experience, key)
     )
-    assert foretold.shape == (4, 5, 2)  # batch, rows, agents
+    assert foretold.shape == (5, 4, 2)  # rows, batch, agents
     off = foretold - sum_of(losses, *names)
     assert 0.2 < (off > 0).mean() < 0.8
 
@@ -887,5 +909,5 @@ def test_the_predicted_error_is_the_models_loss_at_each_row_of_each_agent(mag):
     assert_allclose(found, huber(off), rtol=1e-4)
     others = [sum_of(losses, *x) for x in (names[1:], names[:-1], (*names, "action"))]
     others.append(sum_of(losses, *names, "alive"))
-    wrong = [huber(foretold - other) for other in others] + [huber(off.mean(i)) for i in (1, 2)]
+    wrong = [huber(foretold - other) for other in others] + [huber(off.mean(i)) for i in (0, 2)]
     assert np.abs(wrong / found - 1).min() > 2e-3  # twenty times the tolerance

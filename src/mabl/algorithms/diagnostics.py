@@ -8,6 +8,7 @@ import optax
 from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import ActionSpace
+from mabl.nets.categorical import still
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey
 from mabl.world_models.base import WorldModel
@@ -81,7 +82,7 @@ def open_loop(
 
     windows = jnp.arange(n_starts)[:, None] + jnp.arange(1, steps + 1)[None]
     return jax.vmap(jax.vmap(one, out_axes=1), out_axes=1)(
-        jax.tree.map(lambda x: x[:, :n_starts], latents),
+        jax.tree.map(lambda x: x[:, :n_starts], still(latents)),
         actions[:, windows],
         jax.random.split(key, (batch, n_starts)),
     )

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
@@ -13,7 +14,7 @@ from mabl.algorithms.model_based import Learner, ModelBased
 from mabl.envs.base import EnvSpec
 from mabl.execution import Policy
 from mabl.imagination import Dream, Imagined
-from mabl.nets.mlp import MLP
+from mabl.nets.mlp import MLP, Features, parts_of, widths_of
 from mabl.replay import Replay, sample_sequences
 from mabl.types import Metrics, PRNGKey
 from mabl.world_models.base import decoder_losses, kl_losses, observe_batch
@@ -55,9 +56,9 @@ class MAG(NamedTuple):
         config = self.config.lookahead
         key_base, key_error = jax.random.split(key)
         base = self.base.init(key_base)
-        n_features = base.model.actor_features(base.model.initial()).shape[-1]
+        seen = widths_of(base.model.actor_features(base.model.initial()))
         error = Team(
-            lambda key: MLP(n_features, 1, config.hidden, config.n_hidden, key),
+            lambda key: MLP(seen, 1, config.hidden, config.n_hidden, key),
             self.spec.n_agents,
             False,
             key_error,
@@ -79,6 +80,7 @@ class MAG(NamedTuple):
         rows = sample_sequences(
             experience.replay, key_sample, config.batch_size, config.batch_length
         )
+        rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)
         observed = observe_batch(base.model, rows, key_observe)
         predicted = jax.vmap(jax.vmap(base.model.predict))(observed.latents)
         losses = decoder_losses(predicted, rows, config, self.spec.action_space)
@@ -115,9 +117,9 @@ class MAG(NamedTuple):
         return self.base.diagnose(learner.base, replay, key)
 
 
-def predict_error(error: Team, features: Float[Array, "N F"]) -> Float[Array, " N"]:
+def predict_error(error: Team, features: Features) -> Float[Array, " N"]:
     """Each agent's predicted model loss at imagined features."""
-    return error.map(lambda net, x: net(x)[0], features)
+    return error.map(lambda net, x: net(*parts_of(x))[0], features)
 
 
 def best_candidate(

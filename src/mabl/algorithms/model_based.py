@@ -17,9 +17,10 @@ from mabl.behaviour.base import Behaviour
 from mabl.envs.base import EnvSpec
 from mabl.execution import Policy
 from mabl.imagination import Dream, Imagined, Step, imagine_trajectory
+from mabl.nets.categorical import still
 from mabl.replay import Replay, sample_sequences
 from mabl.rows import TimeStep, is_last
-from mabl.types import Metrics, PRNGKey, Replayed, TeamView
+from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 from mabl.world_models.base import WorldModel, WorldModelConfig, model_loss, observe_sequence
 
 N_DIAGNOSED = 128
@@ -81,9 +82,20 @@ class ModelBased(NamedTuple):
         self, learner: Learner, experience: Experience, key: PRNGKey, step: Step = Dream.step
     ) -> tuple[Learner, Metrics]:
         """Draw B_R sequences, imagine from their latents, train theta and phi (lines 10-13)."""
+        key_imagine, key_learn = jax.random.split(key)
+        trajectory, replayed = self.imagine(learner, experience.replay, key_imagine, step)
+        behaviour, metrics = self.behaviour.update(
+            learner.behaviour, trajectory, replayed, key_learn
+        )
+        return learner._replace(behaviour=behaviour), metrics
+
+    def imagine(
+        self, learner: Learner, replay: Replay, key: PRNGKey, step: Step = Dream.step
+    ) -> tuple[Trajectory, Replayed]:
+        """Trajectories from the latents of B_R sequences, and these sequences (lines 10-11)."""
         sizes = self.config.world_model
-        key_sample, key_observe, key_start, key_imagine, key_learn = jax.random.split(key, 5)
-        rows = sample_sequences(experience.replay, key_sample, sizes.batch_size, sizes.batch_length)
+        key_sample, key_observe, key_start, key_imagine = jax.random.split(key, 4)
+        rows = sample_sequences(replay, key_sample, sizes.batch_size, sizes.batch_length)
         latents = self._observe(learner, rows, key_observe)
         start, weight = starts(latents, rows, key_start, self.config.imagination.n_starts)
         dream = self.dream(learner)
@@ -93,10 +105,7 @@ class ModelBased(NamedTuple):
         view = jax.vmap(jax.vmap(lambda *state: self._view(learner.model, *state)))(
             latents, rows.available, rows.alive
         )
-        behaviour, metrics = self.behaviour.update(
-            learner.behaviour, trajectory, Replayed(view, rows), key_learn
-        )
-        return learner._replace(behaviour=behaviour), metrics
+        return trajectory, Replayed(view, rows)
 
     def diagnose(self, learner: Learner, replay: Replay, key: PRNGKey) -> Metrics:
         """How well the world model predicts sequences of the replay, and what is expected of them.
@@ -129,9 +138,9 @@ class ModelBased(NamedTuple):
         )
 
     def _observe(self, learner: Learner, rows: TimeStep, key: PRNGKey) -> Any:
-        """Posterior latents of sequences `[B, T, ...]`."""
+        """Posterior latents of sequences `[B, T, ...]`, through which no gradient flows."""
         keys = jax.random.split(key, rows.is_first.shape[0])
-        return jax.vmap(lambda *at: observe_sequence(learner.model, *at)[0])(rows, keys)
+        return still(jax.vmap(lambda *at: observe_sequence(learner.model, *at)[0])(rows, keys))
 
     def _view(self, model: WorldModel, latent: Any, available: Array, alive: Array) -> TeamView:
         """What behaviour sees of one row's latent."""

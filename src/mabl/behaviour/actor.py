@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mabl.envs.base import ActionSpace, Continuous
 from mabl.nets.categorical import sample_index
-from mabl.nets.mlp import MLP
+from mabl.nets.mlp import MLP, Features, Widths, parts_of
 from mabl.types import PRNGKey
 
 LEAST_LOG_STD = -5.0
@@ -106,20 +106,18 @@ class Actor(eqx.Module):
 
     def __init__(
         self,
-        n_features: int,
+        seen: Widths,
         n_actions: int,
         hidden: int,
         n_hidden: int,
         out_scale: float,
         key: PRNGKey,
     ):
-        self.mlp = MLP(n_features, n_actions, hidden, n_hidden, key, out_scale)
+        self.mlp = MLP(seen, n_actions, hidden, n_hidden, key, out_scale)
 
-    def __call__(
-        self, features: Float[Array, " F"], available: Bool[Array, " A"]
-    ) -> MaskedCategorical:
+    def __call__(self, features: Features, available: Bool[Array, " A"]) -> MaskedCategorical:
         """The policy at one agent's features."""
-        return MaskedCategorical.of(self.mlp(features), available)
+        return MaskedCategorical.of(self.mlp(*parts_of(features)), available)
 
 
 class ContinuousActor(eqx.Module):
@@ -133,7 +131,7 @@ class ContinuousActor(eqx.Module):
 
     def __init__(
         self,
-        n_features: int,
+        seen: Widths,
         n_actions: int,
         hidden: int,
         n_hidden: int,
@@ -141,28 +139,26 @@ class ContinuousActor(eqx.Module):
         initial_std: float,
         key: PRNGKey,
     ):
-        self.mlp = MLP(n_features, n_actions, hidden, n_hidden, key, out_scale)
+        self.mlp = MLP(seen, n_actions, hidden, n_hidden, key, out_scale)
         self.log_std = jnp.full(n_actions, log(initial_std), jnp.float32)
 
-    def __call__(
-        self, features: Float[Array, " F"], available: Bool[Array, " A"]
-    ) -> CensoredNormal:
+    def __call__(self, features: Features, available: Bool[Array, " A"]) -> CensoredNormal:
         """The policy at one agent's features; `available` are the dimensions that it has."""
         std = jnp.exp(jnp.maximum(self.log_std, LEAST_LOG_STD))
-        return CensoredNormal(self.mlp(features), std, available)
+        return CensoredNormal(self.mlp(*parts_of(features)), std, available)
 
 
 def actor_for(
     space: ActionSpace,
-    n_features: int,
+    seen: Widths,
     hidden: int,
     n_hidden: int,
     out_scale: float,
     initial_std: float,
     key: PRNGKey,
 ) -> Actor | ContinuousActor:
-    """A fresh policy over a space of actions."""
-    sizes = n_features, space.size, hidden, n_hidden, out_scale
+    """A fresh policy over a space of actions; `seen` are the widths of its features."""
+    sizes = seen, space.size, hidden, n_hidden, out_scale
     if isinstance(space, Continuous):
         return ContinuousActor(*sizes, initial_std, key)
     return Actor(*sizes, key)

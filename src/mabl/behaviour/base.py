@@ -9,11 +9,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mabl.behaviour.actor import Choice
 from mabl.envs.base import ActionSpace
+from mabl.nets.mlp import Features
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 
 S = TypeVar("S")
 
-ActorFunction = Callable[[Float[Array, " F"], Bool[Array, " A"]], Choice]
+ActorFunction = Callable[[Features, Bool[Array, " A"]], Choice]
 """A policy: one agent's features and available actions to a choice; a pytree of its parameters."""
 
 
@@ -31,7 +32,7 @@ class Behaviour(Protocol[S]):
         """The policy that acts, in the environment as in imagination."""
         ...
 
-    def critic_features(self, model: Any, latent: Any) -> Float[Array, "N G"]:
+    def critic_features(self, model: Any, latent: Any) -> Features:
         """What of a world model's latent only training sees."""
         ...
 

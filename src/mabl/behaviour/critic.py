@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mabl.nets.attention import SelfAttention
-from mabl.nets.mlp import MLP, Linear
+from mabl.nets.mlp import MLP, Features, Linear, Widths, parts_of
 from mabl.types import PRNGKey
 
 
@@ -20,17 +20,17 @@ class Critic(eqx.Module):
     attention: SelfAttention
     mlp: MLP
 
-    def __init__(self, n_features: int, hidden: int, n_hidden: int, n_heads: int, key: PRNGKey):
+    def __init__(self, seen: Widths, hidden: int, n_hidden: int, n_heads: int, key: PRNGKey):
         key_embed, key_attention, key_mlp = jax.random.split(key, 3)
-        self.embed = Linear(n_features, hidden, key_embed)
+        self.embed = Linear(seen, hidden, key_embed)
         self.attention = SelfAttention(hidden, n_heads, key_attention)
         self.mlp = MLP(hidden, 1, hidden, n_hidden, key_mlp)
 
     def __call__(
-        self, features: Float[Array, "N G"], heard: Bool[Array, " N"] | None = None
+        self, features: Features, heard: Bool[Array, " N"] | None = None
     ) -> Float[Array, " N"]:
-        """One value for each agent of a team."""
-        heard = jnp.ones(features.shape[0], bool) if heard is None else heard
-        x = jax.nn.relu(jax.vmap(self.embed)(features))
+        """One value for each agent of a team, from features `[N, ...]`."""
+        x = jax.nn.relu(jax.vmap(self.embed)(*parts_of(features)))
+        heard = jnp.ones(x.shape[0], bool) if heard is None else heard
         x = x + self.attention(x, heard)
         return jax.vmap(self.mlp)(x)[:, 0]

@@ -19,6 +19,7 @@ from mabl.envs.base import ActionSpace
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.ppo import clipped_surrogate
 from mabl.losses.returns import lambda_returns
+from mabl.nets.mlp import Features, widths_of
 from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
@@ -91,7 +92,7 @@ class MAPPOConfig:
             )
 
 
-ValueFunction = Callable[[Float[Array, "N G"]], Float[Array, " N"]]
+ValueFunction = Callable[[Features], Float[Array, " N"]]
 """What a critic is to the losses: features of a team to a value for each agent.
 
 The dead are heard too: their latents are no padding, and know of the team (ADR 9).
@@ -109,7 +110,7 @@ class ActorCritic(NamedTuple):
     returns: Normaliser
     """Of what the critic learns."""
 
-    def value(self, features: Float[Array, "N G"]) -> Float[Array, " N"]:
+    def value(self, features: Features) -> Float[Array, " N"]:
         """The critic's, in the rewards' units."""
         return self.returns.restore(self.critic(features))
 
@@ -142,17 +143,17 @@ class MAPPO(NamedTuple):
         """Fresh networks for features of the view's sizes."""
         config = self.config
         key_actor, key_critic = jax.random.split(key)
-        n_actor, n_critic = view.actor_features.shape[-1], view.critic_features.shape[-1]
         actor = actor_for(
             space,
-            n_actor,
+            widths_of(view.actor_features),
             config.hidden,
             config.n_hidden,
             config.actor_out_scale,
             config.initial_std,
             key_actor,
         )
-        critic = Critic(n_critic, config.hidden, config.n_hidden, config.n_heads, key_critic)
+        seen = widths_of(view.critic_features)
+        critic = Critic(seen, config.hidden, config.n_hidden, config.n_heads, key_critic)
         actor_optimiser, critic_optimiser = optimisers(config)
         return ActorCritic(
             actor=actor,
@@ -167,7 +168,7 @@ class MAPPO(NamedTuple):
         """The policy."""
         return state.actor
 
-    def critic_features(self, model: Any, latent: Any) -> Float[Array, "N G"]:
+    def critic_features(self, model: Any, latent: Any) -> Features:
         """All that the model has for critics, or its global latents alone."""
         if self.config.global_critic and hasattr(model, "global_features"):
             return model.global_features(latent)

@@ -15,7 +15,7 @@ from mabl.behaviour.base import minibatches
 from mabl.envs.base import ActionSpace
 from mabl.errors import require_between, require_positive
 from mabl.losses.returns import lambda_returns
-from mabl.nets.mlp import MLP
+from mabl.nets.mlp import MLP, Features, Part, Width, parts_of, widths_of
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 
 
@@ -69,12 +69,11 @@ class EpsilonGreedy(eqx.Module):
     q: MLP
     epsilon: Float[Array, ""]
 
-    def __call__(
-        self, features: Float[Array, " F"], available: Bool[Array, " A"]
-    ) -> MaskedCategorical:
+    def __call__(self, features: Features, available: Bool[Array, " A"]) -> MaskedCategorical:
         """The policy at one agent's features; where nothing is available, everything is."""
         may = available | ~available.any()
-        best = jax.nn.one_hot(jnp.where(may, self.q(features), -jnp.inf).argmax(), may.shape[0])
+        q = self.q(*parts_of(features))
+        best = jax.nn.one_hot(jnp.where(may, q, -jnp.inf).argmax(), may.shape[0])
         epsilon = jnp.minimum(self.epsilon, 0.999)  # the best action stays the likeliest
         probs = (1 - epsilon) * best + epsilon * may / may.sum()
         return MaskedCategorical.of(jnp.log(jnp.maximum(probs, 1e-20)), available)
@@ -92,15 +91,16 @@ class Mixer(eqx.Module):
     weight_out: MLP
     bias_out: MLP
 
-    def __init__(self, n_agents: int, n_features: int, hidden: int, hypernet: int, key: PRNGKey):
+    def __init__(self, n_agents: int, seen: Width, hidden: int, hypernet: int, key: PRNGKey):
+        """`seen` is the width of all agents' features together."""
         keys = jax.random.split(key, 4)
-        self.weight_in = MLP(n_features, n_agents * hidden, hypernet, 1, keys[0])
-        self.bias_in = MLP(n_features, hidden, hypernet, 0, keys[1])
-        self.weight_out = MLP(n_features, hidden, hypernet, 1, keys[2])
-        self.bias_out = MLP(n_features, 1, hypernet, 1, keys[3])
+        self.weight_in = MLP(seen, n_agents * hidden, hypernet, 1, keys[0])
+        self.bias_in = MLP(seen, hidden, hypernet, 0, keys[1])
+        self.weight_out = MLP(seen, hidden, hypernet, 1, keys[2])
+        self.bias_out = MLP(seen, 1, hypernet, 1, keys[3])
 
-    def __call__(self, q: Float[Array, " N"], features: Float[Array, "N G"]) -> Float[Array, ""]:
-        """The team's value of the agents' values `q`."""
+    def __call__(self, q: Float[Array, " N"], features: Part) -> Float[Array, ""]:
+        """The team's value of the agents' values `q`, given features `[N, ...]`."""
         seen = features.ravel()
         weight = rearrange(jnp.abs(self.weight_in(seen)), "(n e) -> n e", n=q.shape[0])
         hidden = jax.nn.elu(q @ weight + self.bias_in(seen))
@@ -120,7 +120,7 @@ class Values(NamedTuple):
 
     def agents(self, view: TeamView) -> Float[Array, "N A"]:
         """Every Q_i."""
-        return jax.vmap(self.q)(view.actor_features)
+        return jax.vmap(self.q)(*parts_of(view.actor_features))
 
     def best(self, view: TeamView) -> Int[Array, " N"]:
         """The available action with the highest Q_i, for each agent."""
@@ -155,15 +155,12 @@ class QMIX(NamedTuple):
         """Fresh networks for features of the view's sizes."""
         config = self.config
         key_q, key_mixer = jax.random.split(key)
-        n_agents, n_features = view.critic_features.shape
+        (seen,) = widths_of(view.critic_features.ravel())
+        seen_q = widths_of(view.actor_features)
         values = Values(
-            MLP(view.actor_features.shape[-1], space.size, config.hidden, config.n_hidden, key_q),
+            MLP(seen_q, space.size, config.hidden, config.n_hidden, key_q),
             Mixer(
-                n_agents,
-                n_agents * n_features,
-                config.mixer_hidden,
-                config.hypernet_hidden,
-                key_mixer,
+                view.alive.shape[0], seen, config.mixer_hidden, config.hypernet_hidden, key_mixer
             ),
         )
         target = jax.tree.map(jnp.copy, values)
@@ -174,7 +171,7 @@ class QMIX(NamedTuple):
         """Epsilon-greedy; its mode is greedy."""
         return EpsilonGreedy(state.values.q, state.epsilon)
 
-    def critic_features(self, model: Any, latent: Any) -> Float[Array, "N G"]:
+    def critic_features(self, model: Any, latent: Any) -> Part:
         """z_global of every agent, for the mixer. Raises TypeError for a model without them."""
         if not hasattr(model, "global_features"):
             raise TypeError(f"QMIX mixes by global latents, and {type(model).__name__} has none")

@@ -1,27 +1,71 @@
 """Fully connected networks with ReLU activations (appendix B.1)."""
 
+from itertools import accumulate, pairwise
+from math import prod
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mabl.nets.categorical import Code, CodeShape
 from mabl.types import PRNGKey
+
+Part = Float[Array, "*b _"] | Code
+"""Some of what a network sees."""
+Features = Any
+"""All that a network sees: a part, or a tuple of parts, as good as their concatenation."""
+Width = int | CodeShape
+"""Of a part: a vector's length, or what a code is made of."""
+Widths = Width | tuple[Width, ...]
+"""Of one part, or of all."""
+
+
+def parts_of(features: Features) -> tuple[Part, ...]:
+    """The one part, or those that there are."""
+    return features if isinstance(features, tuple) else (features,)
+
+
+def widths_of(features: Features) -> tuple[Width, ...]:
+    """Of all parts."""
+    return tuple(x.shape if isinstance(x, Code) else x.shape[-1] for x in parts_of(features))
+
+
+def dense(features: Features) -> Float[Array, "*b F"]:
+    """All parts as one vector."""
+    parts = [x.onehot() if isinstance(x, Code) else x for x in parts_of(features)]
+    return jnp.concatenate(parts, axis=-1)
 
 
 class Linear(eqx.Module):
-    """y = W x + b with Xavier-uniform weights (decision 12) and zero bias."""
+    """y = W x + b with Xavier-uniform weights (decision 12) and zero bias; x may come in parts."""
 
-    weight: Float[Array, "I O"]
+    weight: Any
+    """`[I, O]`, or `[K, C, O]` for a code; a tuple of these where x comes in several parts."""
     bias: Float[Array, " O"]
 
-    def __init__(self, n_in: int, n_out: int, key: PRNGKey, scale: float = 1.0):
-        limit = scale * (6 / (n_in + n_out)) ** 0.5
-        self.weight = jax.random.uniform(key, (n_in, n_out), minval=-limit, maxval=limit)
+    def __init__(self, n_in: Widths, n_out: int, key: PRNGKey, scale: float = 1.0):
+        one = isinstance(n_in, int | CodeShape)
+        widths: tuple[Any, ...] = (n_in,) if one else n_in
+        shapes = [tuple(w) if isinstance(w, CodeShape) else (w,) for w in widths]
+        ends = list(accumulate(prod(shape) for shape in shapes))
+        limit = scale * (6 / (ends[-1] + n_out)) ** 0.5
+        whole = jax.random.uniform(key, (ends[-1], n_out), minval=-limit, maxval=limit)
+        blocks = [
+            rows.reshape(*shape, n_out)
+            for shape, rows in zip(shapes, jnp.split(whole, ends[:-1]), strict=True)
+        ]
+        self.weight = tuple(blocks) if len(blocks) > 1 else blocks[0]
         self.bias = jnp.zeros(n_out)
 
-    def __call__(self, x: Float[Array, " I"]) -> Float[Array, " O"]:
-        """Apply to one vector."""
-        return x @ self.weight + self.bias
+    def __call__(self, *parts: Part) -> Float[Array, "*b O"]:
+        """Apply to one vector, in as many parts as there are blocks of weights."""
+        total = self.bias
+        blocks = self.weight if isinstance(self.weight, tuple) else (self.weight,)
+        for part, block in zip(parts, blocks, strict=True):
+            total = total + (part.times(block) if isinstance(part, Code) else part @ block)
+        return total
 
 
 class MLP(eqx.Module):
@@ -34,23 +78,24 @@ class MLP(eqx.Module):
 
     def __init__(
         self,
-        n_in: int,
+        n_in: Widths,
         n_out: int,
         hidden: int,
         n_hidden: int,
         key: PRNGKey,
         out_scale: float = 1.0,
     ):
-        widths = [n_in] + [hidden] * n_hidden + [n_out]
+        widths = [n_in, *[hidden] * n_hidden, n_out]
         scales = [1.0] * n_hidden + [out_scale]
         keys = jax.random.split(key, n_hidden + 1)
         self.layers = [
-            Linear(i, o, k, s)
-            for i, o, k, s in zip(widths[:-1], widths[1:], keys, scales, strict=True)
+            Linear(i, o, k, s) for (i, o), k, s in zip(pairwise(widths), keys, scales, strict=True)
         ]
 
-    def __call__(self, x: Float[Array, " I"]) -> Float[Array, " O"]:
-        """Apply to one vector."""
-        for layer in self.layers[:-1]:
-            x = jax.nn.relu(layer(x))
-        return self.layers[-1](x)
+    def __call__(self, *parts: Part) -> Float[Array, "*b O"]:
+        """Apply to one vector, which may come in parts."""
+        first, *rest = self.layers
+        x = first(*parts)
+        for layer in rest:
+            x = layer(jax.nn.relu(x))
+        return x

@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 from mabl.envs.base import ActionSpace, Discrete
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.kl import balanced_kl, categorical_kl
+from mabl.nets.categorical import CodeShape
+from mabl.nets.mlp import Features
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey
 from mabl.world_models.heads import Predictions
@@ -68,6 +70,11 @@ class WorldModelConfig:
     batch_length: int = 20
     """Rows of a sequence, 2 at least."""
 
+    @property
+    def latent(self) -> CodeShape:
+        """Of a latent state."""
+        return CodeShape(self.n_categoricals, self.n_classes)
+
     def __post_init__(self) -> None:
         require_positive(self, "hidden", "n_hidden", "n_categoricals", "n_classes", "batch_size")
         require_positive(self, "learning_rate", "grad_clip")
@@ -117,12 +124,12 @@ class WorldModel(Protocol[L]):
         """What the model says of a row."""
         ...
 
-    def actor_features(self, latent: L) -> Float[Array, "N F"]:
-        """What policies see."""
+    def actor_features(self, latent: L) -> Features:
+        """What policies see; `[N, ...]`."""
         ...
 
-    def critic_features(self, latent: L) -> Float[Array, "N G"]:
-        """What critics see."""
+    def critic_features(self, latent: L) -> Features:
+        """What critics see; `[N, ...]`."""
         ...
 
 
@@ -156,6 +163,7 @@ def model_loss(
     `config.overshooting` the decoders also see the latent that the prior predicts for each row from
     the row before (at a first row, from nothing): what imagination decodes and the KL alone trains.
     """
+    rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)  # as the scan over time leaves them
     observed = observe_batch(model, rows, key, train=True)
     predicted = jax.vmap(jax.vmap(model.predict))(observed.latents)
     losses = decoder_losses(predicted, rows, config, action_space)
@@ -175,29 +183,30 @@ def model_loss(
 
 
 class Observed(NamedTuple):
-    """What a model makes of real sequences: `[B, T, ...]`."""
+    """What a model makes of real sequences: `[T, B, ...]`."""
 
     latents: Any
     """Posterior latents."""
     prior_latents: Any
     """Prior latents of the same rows, from the rows before."""
-    posterior: dict[str, Float[Array, "B T *n K C"]]
-    prior: dict[str, Float[Array, "B T *n K C"]]
+    posterior: dict[str, Float[Array, "T B *n K C"]]
+    prior: dict[str, Float[Array, "T B *n K C"]]
 
 
 def observe_batch(model: WorldModel, rows: TimeStep, key: PRNGKey, train: bool = False) -> Observed:
-    """Posteriors and priors of sequences `[B, T, ...]`."""
-    batch, length = rows.is_first.shape
+    """Posteriors and priors of sequences, time first: `[T, B, ...]`."""
+    length, batch = rows.is_first.shape
     key_observe, key_prior = jax.random.split(key)
-    latents, posterior = jax.vmap(lambda rows, key: observe_sequence(model, rows, key, train))(
-        rows, jax.random.split(key_observe, batch)
+    observe = jax.vmap(
+        lambda rows, key: observe_sequence(model, rows, key, train), in_axes=(1, 0), out_axes=1
     )
-    keys_prior = jax.random.split(key_prior, (batch, length))
+    latents, posterior = observe(rows, jax.random.split(key_observe, batch))
+    keys_prior = jax.random.split(key_prior, (length, batch))
     prior_latents, prior = jax.vmap(jax.vmap(model.prior))(latents, keys_prior)
     return Observed(latents, prior_latents, posterior, prior)
 
 
-def kl_losses(observed: Observed, config: WorldModelConfig) -> dict[str, Float[Array, "B T *n"]]:
+def kl_losses(observed: Observed, config: WorldModelConfig) -> dict[str, Float[Array, "T B *n"]]:
     """Balanced and weighted KL of each level."""
     return {
         f"kl_{level}": config.kl_weight
@@ -215,8 +224,8 @@ def kl_losses(observed: Observed, config: WorldModelConfig) -> dict[str, Float[A
 
 def decoder_losses(
     predicted: Predictions, rows: TimeStep, config: WorldModelConfig, action_space: ActionSpace
-) -> dict[str, Float[Array, "B T N"]]:
-    """-log likelihoods of rows `[B, T, ...]` under what is decoded from their latents, weighted.
+) -> dict[str, Float[Array, "*b N"]]:
+    """-log likelihoods of rows `[*b, ...]` under what is decoded from their latents, weighted.
 
     -log p(o^i | z^a, h^a), -log p(r^i | z^a, h^a), and -log p(. | z^a, z^g, h^a, h^g) of
     termination, availability and the action a^i_{t-1} (sections 3.1.2 and 3.2), and of life

@@ -45,20 +45,18 @@ class BiLevel(eqx.Module):
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, n_seen: int, key: PRNGKey):
         """The global posterior sees the z_agent of `n_seen` agents."""
         keys = jax.random.split(key, 7)
-        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
-        latent_dim, action_dim = k * c, spec.action_space.size
-        level_dim = hidden + latent_dim
-        self.filter = AgentFilter(spec.obs_dim, action_dim, hidden, k, c, keys[0])
+        hidden, latent = config.hidden, config.latent
+        action_dim = spec.action_space.size
+        self.filter = AgentFilter(spec.obs_dim, action_dim, hidden, latent, keys[0])
         self.state_encoder = MLP(spec.state_dim, hidden, hidden, 2, keys[1])
-        self.global_recurrent = Recurrent(latent_dim, spec.n_agents * action_dim, hidden, keys[2])
-        self.global_posterior = Categoricals(
-            2 * hidden + n_seen * latent_dim, hidden, k, c, keys[3]
-        )
-        self.global_prior = Categoricals(hidden, hidden, k, c, keys[4])
-        self.agent_prior = Categoricals(hidden + latent_dim, hidden, k, c, keys[5])
+        self.global_recurrent = Recurrent(latent, spec.n_agents * action_dim, hidden, keys[2])
+        seen = latent._replace(n_categoricals=n_seen * latent.n_categoricals)
+        self.global_posterior = Categoricals((hidden, seen, hidden), hidden, latent, keys[3])
+        self.global_prior = Categoricals((hidden,), hidden, latent, keys[4])
+        self.agent_prior = Categoricals((hidden, latent), hidden, latent, keys[5])
         self.heads = Heads(
-            agent_dim=level_dim,
-            full_dim=2 * level_dim,
+            agent=(latent, hidden),
+            full=(latent, latent, hidden, hidden),
             obs_dim=spec.obs_dim,
             action_dim=action_dim,
             hidden=hidden,

@@ -7,11 +7,13 @@ import jax
 from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import EnvSpec
+from mabl.nets.categorical import draw, still
+from mabl.nets.mlp import Features
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads, Predictions
-from mabl.world_models.levels import AgentFilter, Categoricals, Level, draw, forget, team_of
+from mabl.world_models.levels import AgentFilter, Categoricals, Level, forget, team_of
 
 
 class Inputs(NamedTuple):
@@ -35,13 +37,13 @@ class DreamerV2(eqx.Module):
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
         keys = jax.random.split(key, 3)
-        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
+        hidden, latent = config.hidden, config.latent
         self.spec = spec
-        self.filter = AgentFilter(spec.obs_dim, spec.action_space.size, hidden, k, c, keys[0])
-        self.agent_prior = Categoricals(hidden, hidden, k, c, keys[1])
+        self.filter = AgentFilter(spec.obs_dim, spec.action_space.size, hidden, latent, keys[0])
+        self.agent_prior = Categoricals((hidden,), hidden, latent, keys[1])
         self.heads = Heads(
-            agent_dim=hidden + k * c,
-            full_dim=hidden + k * c,
+            agent=(latent, hidden),
+            full=(latent, hidden),
             obs_dim=spec.obs_dim,
             action_dim=spec.action_space.size,
             hidden=hidden,
@@ -52,7 +54,8 @@ class DreamerV2(eqx.Module):
 
     def initial(self) -> Level:
         """The team's latent before an episode's first row: zeros."""
-        return team_of(self.spec.n_agents, self.filter.initial())
+        own = Level.none(self.filter.hidden, self.filter.latent)
+        return team_of(self.spec.n_agents, own)
 
     def encode(self, row: TimeStep) -> Inputs:
         """Encode actions and observations of one row."""
@@ -79,16 +82,16 @@ class DreamerV2(eqx.Module):
     def imagine(self, latent: Level, action: Float[Array, "N A"], key: PRNGKey) -> Level:
         """Prior latents of the next row, every agent's after its own action."""
         h = jax.vmap(self.filter.recurrent)(latent, action)
-        return self.prior(latent._replace(h=h), key)[0]
+        return still(self.prior(latent._replace(h=h), key)[0])
 
     def predict(self, latent: Level) -> Predictions:
         """Decode a row for every agent from its own latent."""
         return jax.vmap(self.heads)(latent.features(), latent.features())
 
-    def actor_features(self, latent: Level) -> Float[Array, "N F"]:
+    def actor_features(self, latent: Level) -> Features:
         """(z, h)."""
         return latent.features()
 
-    def critic_features(self, latent: Level) -> Float[Array, "N F"]:
+    def critic_features(self, latent: Level) -> Features:
         """(z, h): there is nothing else."""
         return latent.features()

@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mabl.nets.mlp import MLP
+from mabl.nets.mlp import MLP, Features, Linear, Widths, parts_of
 from mabl.types import PRNGKey
 
 
@@ -32,20 +33,23 @@ class Heads(eqx.Module):
     """The decoders of one agent, of `n_hidden` hidden layers each (Table 2: two).
 
     With `both_levels_reward` a second reward predictor sees both levels; ADR 4 says why. Life comes
-    from the decoder of availability, as one Bernoulli more (ADR 9).
+    from the decoder of availability, as one Bernoulli more (ADR 9). First layers that see the same
+    are computed as one.
     """
 
+    agent_in: Linear
+    full_in: Linear
     obs: MLP
     agent_reward: MLP
-    full_reward: MLP | None
     terminated: MLP
     available: MLP
     action: MLP
+    full_reward: MLP | None
 
     def __init__(
         self,
-        agent_dim: int,
-        full_dim: int,
+        agent: Widths,
+        full: Widths,
         obs_dim: int,
         action_dim: int,
         hidden: int,
@@ -53,26 +57,40 @@ class Heads(eqx.Module):
         both_levels_reward: bool,
         key: PRNGKey,
     ):
+        """`agent` and `full` are the widths of what decoders see: its own level, and all levels."""
         keys = jax.random.split(key, 6)
-        self.obs = MLP(agent_dim, obs_dim, hidden, n_hidden, keys[0])
-        self.agent_reward = MLP(agent_dim, 1, hidden, n_hidden, keys[1])
-        self.terminated = MLP(full_dim, 1, hidden, n_hidden, keys[2])
-        self.available = MLP(full_dim, action_dim + 1, hidden, n_hidden, keys[3])
-        self.action = MLP(full_dim, action_dim, hidden, n_hidden, keys[4])
-        self.full_reward = (
-            MLP(full_dim, 1, hidden, n_hidden, keys[5]) if both_levels_reward else None
-        )
 
-    def __call__(self, agent: Float[Array, " F"], full: Float[Array, " G"]) -> Predictions:
+        def decoders(seen: Widths, sizes: tuple[int, ...], keys: Array) -> tuple[Linear, list[MLP]]:
+            whole = [MLP(seen, n, hidden, n_hidden, k) for n, k in zip(sizes, keys, strict=True)]
+            first = jax.tree.map(
+                lambda *x: jnp.concatenate(x, axis=-1), *(mlp.layers[0] for mlp in whole)
+            )
+            return first, [eqx.tree_at(lambda m: m.layers, m, m.layers[1:]) for m in whole]
+
+        self.agent_in, (self.obs, self.agent_reward) = decoders(agent, (obs_dim, 1), keys[:2])
+        sizes = (1, action_dim + 1, action_dim) + (1,) * both_levels_reward
+        self.full_in, rest = decoders(full, sizes, keys[2 : 2 + len(sizes)])
+        self.terminated, self.available, self.action = rest[:3]
+        self.full_reward = rest[3] if both_levels_reward else None
+
+    def __call__(self, agent: Features, full: Features) -> Predictions:
         """Decode one agent's latents: its own level, and all levels."""
-        agent_reward = self.agent_reward(agent)[0]
-        available = self.available(full)
+
+        def split(first: Linear, seen: Features, n: int) -> list[Float[Array, " D"]]:
+            return jnp.split(jax.nn.relu(first(*parts_of(seen))), n, axis=-1)
+
+        obs, reward = split(self.agent_in, agent, 2)
+        terminated, available, action, *both = split(
+            self.full_in, full, 4 if self.full_reward else 3
+        )
+        offered = self.available(available)
+        agent_reward = self.agent_reward(reward)[0]
         return Predictions(
-            obs=self.obs(agent),
-            reward=self.full_reward(full)[0] if self.full_reward else agent_reward,
+            obs=self.obs(obs),
+            reward=self.full_reward(both[0])[0] if self.full_reward else agent_reward,
             agent_reward=agent_reward if self.full_reward else None,
-            terminated=self.terminated(full)[0],
-            available=available[:-1],
-            alive=available[-1],
-            action=self.action(full),
+            terminated=self.terminated(terminated)[0],
+            available=offered[:-1],
+            alive=offered[-1],
+            action=self.action(action),
         )

@@ -1,14 +1,14 @@
 """The parts that one level of a latent-variable model is made of (section 3.1.1)."""
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mabl.nets.categorical import flatten, sample_straight_through, unflatten
-from mabl.nets.mlp import MLP, Linear
+from mabl.nets.categorical import Code, CodeShape, draw, still, unflatten
+from mabl.nets.mlp import MLP, Features, Linear, Part, Widths
 from mabl.types import PRNGKey
 
 Tree = TypeVar("Tree")
@@ -18,11 +18,16 @@ class Level(NamedTuple):
     """The latent of one level: deterministic embedding and stochastic state."""
 
     h: Float[Array, "*b D"]
-    z: Float[Array, "*b KC"]
+    z: Code
 
-    def features(self) -> Float[Array, "*b F"]:
+    @classmethod
+    def none(cls, hidden: int, shape: CodeShape) -> "Level":
+        """Before an episode's first row: zeros."""
+        return cls(jnp.zeros(hidden), Code.none(shape))
+
+    def features(self) -> Features:
         """(z, h), as networks see them."""
-        return jnp.concatenate([self.z, self.h], axis=-1)
+        return self.z, self.h
 
 
 class Recurrent(eqx.Module):
@@ -31,14 +36,14 @@ class Recurrent(eqx.Module):
     inputs: Linear
     cell: eqx.nn.GRUCell
 
-    def __init__(self, latent_dim: int, action_dim: int, hidden: int, key: PRNGKey):
+    def __init__(self, latent: CodeShape, action_dim: int, hidden: int, key: PRNGKey):
         key_inputs, key_cell = jax.random.split(key)
-        self.inputs = Linear(latent_dim + action_dim, hidden, key_inputs)
+        self.inputs = Linear((latent, action_dim), hidden, key_inputs)
         self.cell = eqx.nn.GRUCell(hidden, hidden, key=key_cell)
 
     def __call__(self, level: Level, action: Float[Array, " A"]) -> Float[Array, " D"]:
         """One step; `action` is encoded, the agent's own or the joint one."""
-        x = jax.nn.relu(self.inputs(jnp.concatenate([level.z, action])))
+        x = jax.nn.relu(self.inputs(level.z, action))
         return self.cell(x, level.h)
 
 
@@ -48,18 +53,13 @@ class Categoricals(eqx.Module):
     mlp: MLP
     n_classes: int = eqx.field(static=True)
 
-    def __init__(self, n_in: int, hidden: int, n_categoricals: int, n_classes: int, key: PRNGKey):
-        self.mlp = MLP(n_in, n_categoricals * n_classes, hidden, 1, key)
-        self.n_classes = n_classes
+    def __init__(self, n_in: Widths, hidden: int, shape: CodeShape, key: PRNGKey):
+        self.mlp = MLP(n_in, shape.n_categoricals * shape.n_classes, hidden, 1, key)
+        self.n_classes = shape.n_classes
 
-    def __call__(self, *inputs: Float[Array, " _"]) -> Float[Array, "K C"]:
-        """Logits given the concatenation of the inputs."""
-        return unflatten(self.mlp(jnp.concatenate(inputs)), self.n_classes)
-
-
-def draw(logits: Float[Array, "*b K C"], key: PRNGKey) -> Float[Array, "*b KC"]:
-    """Sample a latent state z, with straight-through gradients."""
-    return flatten(sample_straight_through(logits, key))
+    def __call__(self, *inputs: Part) -> Float[Array, "K C"]:
+        """Logits given the inputs."""
+        return unflatten(self.mlp(*inputs), self.n_classes)
 
 
 def team_of(n_agents: int, own: Tree) -> Tree:
@@ -68,8 +68,15 @@ def team_of(n_agents: int, own: Tree) -> Tree:
 
 
 def forget(past: Tree, is_first: Bool[Array, ""]) -> Tree:
-    """Zeros at an episode's first row, else the past as it is."""
-    return jax.tree.map(lambda x: jnp.where(is_first, jnp.zeros_like(x), x), past)
+    """Zeros, and codes of nothing, at an episode's first row, else the past as it is."""
+
+    def zeros(x: Any) -> Any:
+        if isinstance(x, Code):
+            index = jnp.where(is_first, x.n_classes, x.index)
+            return Code(index, forget(x.tilt, is_first), x.n_classes)
+        return jnp.where(is_first, jnp.zeros_like(x), x)
+
+    return jax.tree.map(zeros, past, is_leaf=lambda x: isinstance(x, Code))
 
 
 class AgentFilter(eqx.Module):
@@ -83,29 +90,19 @@ class AgentFilter(eqx.Module):
     recurrent: Recurrent
     posterior: Categoricals
     obs_dim: int = eqx.field(static=True)
-    latent_dim: int = eqx.field(static=True)
+    latent: CodeShape = eqx.field(static=True)
     hidden: int = eqx.field(static=True)
 
-    def __init__(
-        self,
-        obs_dim: int,
-        action_dim: int,
-        hidden: int,
-        n_categoricals: int,
-        n_classes: int,
-        key: PRNGKey,
-    ):
+    def __init__(self, obs_dim: int, action_dim: int, hidden: int, latent: CodeShape, key: PRNGKey):
         key_encoder, key_recurrent, key_posterior = jax.random.split(key, 3)
-        self.obs_dim = obs_dim
-        self.latent_dim = n_categoricals * n_classes
-        self.hidden = hidden
+        self.obs_dim, self.latent, self.hidden = obs_dim, latent, hidden
         self.encoder = MLP(obs_dim, hidden, hidden, 2, key_encoder)
-        self.recurrent = Recurrent(self.latent_dim, action_dim, hidden, key_recurrent)
-        self.posterior = Categoricals(2 * hidden, hidden, n_categoricals, n_classes, key_posterior)
+        self.recurrent = Recurrent(latent, action_dim, hidden, key_recurrent)
+        self.posterior = Categoricals((hidden, hidden), hidden, latent, key_posterior)
 
     def initial(self) -> Level:
         """The latent before an episode's first row: zeros."""
-        return Level(jnp.zeros(self.hidden), jnp.zeros(self.latent_dim))
+        return still(Level.none(self.hidden, self.latent))
 
     def embed(self, obs: Float[Array, " O"]) -> Float[Array, " D"]:
         """Encode o_t^i; independent of the past, so that training does it outside the scan."""
@@ -123,8 +120,8 @@ class AgentFilter(eqx.Module):
         self, level: Level, prev_action: Float[Array, " A"], obs: Float[Array, " O"], key: PRNGKey
     ) -> Level:
         """One step of execution; the caller resets `level` and `prev_action` at a first row."""
-        return self.infer(level, prev_action, self.embed(obs), key)[0]
+        return still(self.infer(level, prev_action, self.embed(obs), key)[0])
 
-    def features(self, level: Level) -> Float[Array, " F"]:
+    def features(self, level: Level) -> Features:
         """(z_t, h_t): what the policy sees."""
         return level.features()

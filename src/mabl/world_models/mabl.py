@@ -2,16 +2,17 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mabl.envs.base import EnvSpec
+from mabl.nets.categorical import Code, draw, still
+from mabl.nets.mlp import Features
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.bilevel import BiLevel, Inputs, Latent
 from mabl.world_models.heads import Predictions
-from mabl.world_models.levels import AgentFilter, Level, draw, forget, team_of
+from mabl.world_models.levels import AgentFilter, Level, forget, team_of
 
 
 class MABL(eqx.Module):
@@ -36,7 +37,7 @@ class MABL(eqx.Module):
 
     def initial(self) -> Latent:
         """The team's latent before an episode's first row: zeros."""
-        level = team_of(self.spec.n_agents, self.filter.initial())
+        level = team_of(self.spec.n_agents, Level.none(self.config.hidden, self.config.latent))
         return Latent(agent=level, global_=level)
 
     def encode(self, row: TimeStep) -> Inputs:
@@ -96,14 +97,14 @@ class MABL(eqx.Module):
             return self._transition(h_agent, h_global, key)[0]
 
         keys = jax.random.split(key, self.spec.n_agents)
-        return jax.vmap(imagine_agent)(latent, action, keys)
+        return still(jax.vmap(imagine_agent)(latent, action, keys))
 
     def _transition(
         self,
         h_agent: Float[Array, " D"],
         h_global: Float[Array, " D"],
         key: PRNGKey,
-        z_global: Float[Array, " KC"] | None = None,
+        z_global: Code | None = None,
     ) -> tuple[Latent, dict[str, Float[Array, "K C"]]]:
         """One agent's transition model (section 3.1.1): a sample and its logits.
 
@@ -129,16 +130,14 @@ class MABL(eqx.Module):
         """
         return jax.vmap(self.nets.heads)(self.actor_features(latent), self.critic_features(latent))
 
-    def actor_features(self, latent: Latent) -> Float[Array, "N F"]:
+    def actor_features(self, latent: Latent) -> Features:
         """(z^a, h^a): all that a policy may see (section 3.3)."""
         return latent.agent.features()
 
-    def critic_features(self, latent: Latent) -> Float[Array, "N G"]:
+    def critic_features(self, latent: Latent) -> Features:
         """(z^a, z^g, h^a, h^g): the centralised critic's input."""
-        return jnp.concatenate(
-            [latent.agent.z, latent.global_.z, latent.agent.h, latent.global_.h], axis=-1
-        )
+        return latent.agent.z, latent.global_.z, latent.agent.h, latent.global_.h
 
-    def global_features(self, latent: Latent) -> Float[Array, "N KC"]:
+    def global_features(self, latent: Latent) -> Code:
         """z^g: what QMIX's mixer sees (section 3.3)."""
         return latent.global_.z

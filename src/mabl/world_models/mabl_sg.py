@@ -2,16 +2,17 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mabl.envs.base import EnvSpec
+from mabl.nets.categorical import Code, draw, still
+from mabl.nets.mlp import Features
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.bilevel import BiLevel, Inputs, Latent
 from mabl.world_models.heads import Predictions
-from mabl.world_models.levels import AgentFilter, Level, draw, forget, team_of
+from mabl.world_models.levels import AgentFilter, Level, forget, team_of
 
 
 class MABLSG(eqx.Module):
@@ -35,7 +36,7 @@ class MABLSG(eqx.Module):
 
     def initial(self) -> Latent:
         """The latents before an episode's first row: zeros."""
-        level = self.filter.initial()
+        level = Level.none(self.config.hidden, self.config.latent)
         return Latent(agent=team_of(self.spec.n_agents, level), global_=level)
 
     def encode(self, row: TimeStep) -> Inputs:
@@ -74,10 +75,10 @@ class MABLSG(eqx.Module):
         h_agent = jax.vmap(self.filter.recurrent)(latent.agent, action)
         h_global = self.nets.global_recurrent(latent.global_, action.ravel())
         moved = Latent(latent.agent._replace(h=h_agent), latent.global_._replace(h=h_global))
-        return self._transition(moved, key)[0]
+        return still(self._transition(moved, key)[0])
 
     def _transition(
-        self, latent: Latent, key: PRNGKey, z_global: Float[Array, " KC"] | None = None
+        self, latent: Latent, key: PRNGKey, z_global: Code | None = None
     ) -> tuple[Latent, dict[str, Array]]:
         """Samples and logits given the deterministic parts of `latent`."""
         key_agents, key_global = jax.random.split(key)
@@ -92,15 +93,15 @@ class MABLSG(eqx.Module):
         """Decode a row for every agent from its own level and the team's."""
         return jax.vmap(self.nets.heads)(self.actor_features(latent), self.critic_features(latent))
 
-    def actor_features(self, latent: Latent) -> Float[Array, "N F"]:
+    def actor_features(self, latent: Latent) -> Features:
         """(z^a, h^a): all that a policy may see."""
         return latent.agent.features()
 
-    def critic_features(self, latent: Latent) -> Float[Array, "N G"]:
-        """Each agent's (z^a, h^a) beside the team's (z^g, h^g)."""
-        team = team_of(self.spec.n_agents, latent.global_.features())
-        return jnp.concatenate([latent.agent.features(), team], axis=-1)
+    def critic_features(self, latent: Latent) -> Features:
+        """Each agent's z^a and h^a beside the team's z^g and h^g."""
+        team = team_of(self.spec.n_agents, latent.global_)
+        return latent.agent.z, team.z, latent.agent.h, team.h
 
-    def global_features(self, latent: Latent) -> Float[Array, "N KC"]:
+    def global_features(self, latent: Latent) -> Code:
         """z^g, the same for every agent."""
         return team_of(self.spec.n_agents, latent.global_.z)

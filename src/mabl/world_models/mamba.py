@@ -16,12 +16,13 @@ from jaxtyping import Array, Bool, Float
 from mabl.envs.base import EnvSpec
 from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.attention import TransformerEncoder
-from mabl.nets.mlp import MLP, Linear
+from mabl.nets.categorical import CodeShape, draw, still
+from mabl.nets.mlp import MLP, Features, Linear
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads, Predictions
-from mabl.world_models.levels import Categoricals, Level, draw, forget
+from mabl.world_models.levels import Categoricals, Level, forget, team_of
 
 
 @dataclass(frozen=True)
@@ -92,21 +93,20 @@ class FilterNets(eqx.Module):
         key: PRNGKey,
     ):
         keys = jax.random.split(key, 5)
-        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
+        hidden, latent = config.hidden, config.latent
         self.encoder = MLP(spec.obs_dim, hidden, hidden, 2, keys[0])
-        self.inputs = Linear(k * c + spec.action_space.size, hidden, keys[1])
+        self.inputs = Linear((latent, spec.action_space.size), hidden, keys[1])
         self.communication = TransformerEncoder(
             hidden, communication.n_layers, communication.n_heads, communication.dropout, keys[2]
         )
         self.cell = eqx.nn.GRUCell(hidden, hidden, key=keys[3])
-        self.posterior = Categoricals(2 * hidden, hidden, k, c, keys[4])
+        self.posterior = Categoricals((hidden, hidden), hidden, latent, keys[4])
 
     def listen(
         self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey | None
     ) -> Float[Array, "N D"]:
         """What this agent's transformer makes of everybody's z and action."""
-        said = jnp.concatenate([latent.level.z, action], axis=-1)
-        said = jax.nn.relu(jax.vmap(self.inputs)(said))
+        said = jax.nn.relu(jax.vmap(self.inputs)(latent.level.z, action))
         return self.communication(said, latent.alive, key)
 
 
@@ -116,7 +116,7 @@ class JointFilter(eqx.Module):
     team: Team
     n_agents: int = eqx.field(static=True)
     obs_dim: int = eqx.field(static=True)
-    latent_dim: int = eqx.field(static=True)
+    latent: CodeShape = eqx.field(static=True)
     hidden: int = eqx.field(static=True)
 
     def __init__(
@@ -128,16 +128,19 @@ class JointFilter(eqx.Module):
         key: PRNGKey,
     ):
         self.n_agents, self.obs_dim = spec.n_agents, spec.obs_dim
-        self.latent_dim, self.hidden = config.n_categoricals * config.n_classes, config.hidden
+        self.latent, self.hidden = config.latent, config.hidden
         self.team = Team(
             lambda key: FilterNets(spec, config, communication, key), spec.n_agents, shared, key
         )
 
     def initial(self) -> Latent:
         """The team's latent before an episode's first row: zeros, nobody to be heard."""
-        n = self.n_agents
-        level = Level(jnp.zeros((n, self.hidden)), jnp.zeros((n, self.latent_dim)))
-        return Latent(level, jnp.zeros(n, bool))
+        return still(self.learning())
+
+    def learning(self) -> Latent:
+        """The same, with a way for gradients."""
+        level = team_of(self.n_agents, Level.none(self.hidden, self.latent))
+        return Latent(level, jnp.zeros(self.n_agents, bool))
 
     def embed(self, obs: Float[Array, "N O"]) -> Float[Array, "N D"]:
         """Encode every agent's observation; independent of the past."""
@@ -177,9 +180,9 @@ class JointFilter(eqx.Module):
         key: PRNGKey,
     ) -> Latent:
         """One step of execution, with everybody's observations in one place."""
-        return self.infer(memory, prev_action, self.embed(obs), alive, key)[0]
+        return still(self.infer(memory, prev_action, self.embed(obs), alive, key)[0])
 
-    def features(self, memory: Latent) -> Float[Array, "N F"]:
+    def features(self, memory: Latent) -> Features:
         """(z_t, h_t) of every agent."""
         return memory.level.features()
 
@@ -192,11 +195,11 @@ class DecoderNets(eqx.Module):
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
         key_prior, key_heads = jax.random.split(key)
-        hidden, k, c = config.hidden, config.n_categoricals, config.n_classes
-        self.prior = Categoricals(hidden, hidden, k, c, key_prior)
+        hidden, latent = config.hidden, config.latent
+        self.prior = Categoricals((hidden,), hidden, latent, key_prior)
         self.heads = Heads(
-            agent_dim=hidden + k * c,
-            full_dim=hidden + k * c,
+            agent=(latent, hidden),
+            full=(latent, hidden),
             obs_dim=spec.obs_dim,
             action_dim=spec.action_space.size,
             hidden=hidden,
@@ -235,7 +238,7 @@ class MAMBA(eqx.Module):
 
     def initial(self) -> Latent:
         """The team's latent before an episode's first row."""
-        return self.filter.initial()
+        return self.filter.learning()
 
     def encode(self, row: TimeStep) -> Inputs:
         """Encode actions and observations of one row."""
@@ -267,7 +270,7 @@ class MAMBA(eqx.Module):
     def imagine(self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey) -> Latent:
         """Prior latents of the next row; who dies in it is not heard from then on."""
         h = self.filter.recur(latent, action)
-        after = self.prior(Latent(Level(h, latent.level.z), latent.alive), key)[0]
+        after = still(self.prior(Latent(Level(h, latent.level.z), latent.alive), key)[0])
         return after._replace(alive=latent.alive & (self.predict(after).alive > 0))
 
     def predict(self, latent: Latent) -> Predictions:
@@ -276,10 +279,10 @@ class MAMBA(eqx.Module):
             lambda nets, features: nets.heads(features, features), latent.level.features()
         )
 
-    def actor_features(self, latent: Latent) -> Float[Array, "N F"]:
+    def actor_features(self, latent: Latent) -> Features:
         """(z, h)."""
         return latent.level.features()
 
-    def critic_features(self, latent: Latent) -> Float[Array, "N F"]:
+    def critic_features(self, latent: Latent) -> Features:
         """(z, h): agents have already heard of each other."""
         return latent.level.features()
