@@ -54,3 +54,17 @@ def _forget_programs():
 
     forget_programs()
     jax.clear_caches()
+
+
+@pytest.fixture
+def mabl(monkeypatch, capsys):
+    """Runs a command in this process; returns exit code, stdout, stderr."""
+    from mabl import cli  # not before its packages are told to check shapes
+
+    def invoke(*arguments):
+        monkeypatch.setattr("sys.argv", ["mabl", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit_:
+            cli.main()
+        return exit_.value.code, *capsys.readouterr()
+
+    return invoke

@@ -40,19 +40,6 @@ SECTIONS = {"training", "world_model", "imagination", "mappo"}
 """Parts of the configuration that MABL reads."""
 
 
-@pytest.fixture
-def mabl(monkeypatch, capsys):
-    """Runs a command in this process; returns exit code, stdout, stderr."""
-
-    def invoke(*arguments):
-        monkeypatch.setattr("sys.argv", ["mabl", *map(str, arguments)])
-        with pytest.raises(SystemExit) as exit_:
-            cli.main()
-        return exit_.value.code, *capsys.readouterr()
-
-    return invoke
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A run of 600 steps, made once."""

@@ -1,4 +1,4 @@
-"""The command line: train, resume, eval, play, envs, check-env, algos."""
+"""The command line: train, resume, eval, play, envs, check-env, bench, algos."""
 
 import errno
 import json
@@ -65,13 +65,7 @@ def run(arguments: list[str]) -> int:
 
 def train(arguments: list[str]) -> int:
     """Train an algorithm in an environment."""
-    from mabl.algorithms.presets import preset
-
-    base = ArgumentParser(add_help=False, allow_abbrev=False)
-    for flag, default in (("--env", "smax/3m"), ("--algo", "mabl"), ("--preset", "quick")):
-        base.add_argument(flag, default=default)
-    chosen, rest = base.parse_known_args(arguments)
-    default = preset(chosen.preset, chosen.env, chosen.algo)
+    default, rest = chosen_preset(arguments)
     config = parse_config(rest, default)
     from mabl.training.run import train as train_run
 
@@ -79,8 +73,26 @@ def train(arguments: list[str]) -> int:
     return INTERRUPTED if train_run(config).interrupted else 0
 
 
+def chosen_preset(arguments: list[str]) -> tuple["Config", list[str]]:
+    """The preset of an environment and an algorithm, and the flags that are left."""
+    from mabl.algorithms.presets import preset
+
+    base = ArgumentParser(add_help=False, allow_abbrev=False)
+    for flag, default in (("--env", "smax/3m"), ("--algo", "mabl"), ("--preset", "quick")):
+        base.add_argument(flag, default=default)
+    chosen, rest = base.parse_known_args(arguments)
+    return preset(chosen.preset, chosen.env, chosen.algo), rest
+
+
 def parse_config(arguments: list[str], default: "Config") -> "Config":
     """`default` with flags applied; sections that the algorithm does not read have no flags."""
+    return parse_with_config(arguments, default, "mabl train", train.__doc__)[0]
+
+
+def parse_with_config(
+    arguments: list[str], default: "Config", prog: str, description: str | None, *own: Any
+) -> tuple["Config", Any]:
+    """A config, and all that was parsed: with it the fields that a command has of its `own`."""
     from mabl.algorithms.config import Config
     from mabl.algorithms.registry import unread
 
@@ -88,15 +100,15 @@ def parse_config(arguments: list[str], default: "Config") -> "Config":
         (section, Annotated[Any, tyro.conf.Fixed, tyro.conf.Suppress], getattr(default, section))
         for section in unread(default.algo)
     ]
-    flags = make_dataclass("Config", hidden, bases=(Config,), frozen=True)
+    flags = make_dataclass("Config", [*own, *hidden], bases=(Config,), frozen=True)
     given = tyro.cli(
         flags,
         args=arguments,
         default=flags(**shallow(default)),
-        prog="mabl train",
-        description=train.__doc__,
+        prog=prog,
+        description=description,
     )
-    return Config(**shallow(given))
+    return Config(**{name: getattr(given, name) for name in shallow(default)}), given
 
 
 @dataclass(frozen=True)
@@ -274,6 +286,33 @@ def check_env(arguments: list[str]) -> int:
     return int(any(finding.verdict == "bad" for finding in findings))
 
 
+BENCH = (
+    ("repeats", Annotated[int, tyro.conf.arg(help="Times that each part is run.")], 5),
+    ("parts", Annotated[tuple[str, ...], tyro.conf.arg(help="Parts to time; all, if none.")], ()),
+    ("json", Annotated[Path | None, tyro.conf.arg(help="File for all numbers.")], None),
+    ("against", Annotated[Path | None, tyro.conf.arg(help="Such a file, to compare with.")], None),
+)
+"""What `mabl bench` reads beside a config."""
+
+
+def bench(arguments: list[str]) -> int:
+    """Time the parts of a run."""
+    default, rest = chosen_preset(arguments)
+    config, given = parse_with_config(rest, default, "mabl bench", bench.__doc__, *BENCH)
+    if given.repeats < 1:
+        raise UserError(f"--repeats is {given.repeats}: give a number above 0")
+    from mabl import bench as benchmark
+
+    baseline = benchmark.read(given.against) if given.against else None
+    console = Console(stderr=True)
+    with console.status("starting") as status:
+        report = benchmark.measure(config, given.repeats, given.parts, status.update)
+    print_table(benchmark.table(report, baseline))
+    if given.json:
+        report.write(given.json)
+    return 0
+
+
 def list_envs(arguments: list[str]) -> None:
     """List environments."""
     tyro.cli(lambda: None, args=arguments, prog="mabl envs", description=list_envs.__doc__)
@@ -348,5 +387,6 @@ COMMANDS = {
     "play": play,
     "envs": list_envs,
     "check-env": check_env,
+    "bench": bench,
     "algos": list_algos,
 }

@@ -1,0 +1,322 @@
+"""How long each part of a run takes, and how near that comes to what the machine can do.
+
+All parts are compiled as training compiles them, and run one after the other in one process. Work
+is the multiplications and additions of matrix products in the program as it is written: what an
+index saves in place of a one-hot vector is not in it.
+"""
+
+import json
+import platform
+import resource
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import jaxprs_in_params
+from rich.table import Table
+
+from mabl.algorithms.base import Experience
+from mabl.algorithms.config import Config
+from mabl.algorithms.mag import MAG
+from mabl.algorithms.model_based import ModelBased
+from mabl.envs.workers import n_cores
+from mabl.errors import UserError
+from mabl.replay import Replay, sample_sequences
+from mabl.runs import folder
+from mabl.training.loop import Training, TrainState
+from mabl.training.programs import build, programs
+from mabl.types import PRNGKey
+
+PEAK_SIZE = 2048
+"""Rows and columns of the matrices whose product is the peak."""
+COPIED = 2**28
+"""Bytes that are copied to measure an accelerator's bandwidth."""
+UPDATES = 5
+"""Model updates in one call, as they follow each other in a cycle."""
+
+
+class Timing(NamedTuple):
+    """One part of a run."""
+
+    seconds: list[float]
+    """Of every repeat."""
+    flop: float
+    """Of the matrix products in it; 0 where they are not counted."""
+    temporary: int
+    """Bytes that its program needs beside inputs and outputs; 0 where it has none of its own."""
+
+    @property
+    def median(self) -> float:
+        """Seconds."""
+        return float(np.median(self.seconds))
+
+
+class Report(NamedTuple):
+    """What was measured in one process."""
+
+    subject: dict[str, Any]
+    """What was run."""
+    machine: dict[str, Any]
+    """Where, and with which versions."""
+    timings: dict[str, Timing]
+    """By part."""
+    peak: dict[str, float]
+    """FLOP/s of a product of square matrices, by type; `copy`: an accelerator's bytes/s."""
+    compile_seconds: float
+    """Until a first cycle has collected: to trace and compile it, without a cache."""
+    memory: int
+    """Most bytes in use: on the device, or of the process where that is the CPU."""
+
+    def write(self, path: Path) -> None:
+        """As JSON."""
+        timings = {
+            name: timing._asdict() | {"median": timing.median}
+            for name, timing in self.timings.items()
+        }
+        path.write_text(json.dumps(self._asdict() | {"timings": timings}, indent=1) + "\n")
+
+
+class Part(NamedTuple):
+    """A pure function that is timed on its own; `times` what it does is done in one call."""
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    times: int = 1
+
+
+def measure(
+    config: Config, repeats: int, names: tuple[str, ...], say: Callable[[str], object]
+) -> Report:
+    """Time the parts in `names`, or all; `say` hears what is going on.
+
+    Raises UserError for a part that the algorithm does not have.
+    """
+    training, run = build(config), programs(config)
+    plan = training.algorithm.config.training
+    states = run.init(jax.random.split(jax.random.key(config.seed), config.num_seeds))
+    timings: dict[str, Timing] = {}
+    with run.open_cycle(config) as cycle, without_cache():
+        say("compiling")
+        start = time.perf_counter()
+        states, _ = jax.block_until_ready(cycle(states, 0, 0))
+        compile_seconds = time.perf_counter() - start
+        say("filling the replay")
+        needed = max(plan.prefill_steps, training.algorithm.rows_needed * plan.num_envs)
+        while int(states.replay.size.sum(-1).min()) < needed:
+            states, _ = cycle(states, 0, 0)
+        parts = parts_of(training, states)
+        known = ["collection", *parts, "cycle"]
+        for name in names:
+            if name not in known:
+                raise UserError(f"{config.algo} has no part {name!r}: give {', '.join(known)}")
+        for name in (name for name in known if name in (names or known)):
+            say(name)
+            if name in parts:
+                timings[name] = timed(parts[name], repeats)
+                continue
+            counts = (plan.model_updates, plan.policy_updates) if name == "cycle" else (0, 0)
+            seconds = []
+            for _ in range(repeats + 1):  # a cycle consumes the states that it is given
+                start = time.perf_counter()
+                states, _ = jax.block_until_ready(cycle(states, *counts))
+                seconds.append(time.perf_counter() - start)
+            timings[name] = Timing(seconds[1:], 0.0, 0)
+            parts = parts_of(training, states)
+    if "cycle" in timings and parts:
+        flop = {name: flop_of(part) / part.times for name, part in parts.items()}
+        work = plan.model_updates * flop["model update"] + plan.policy_updates * (
+            flop["imagination"] + flop["behaviour update"]
+        )
+        timings["cycle"] = timings["cycle"]._replace(flop=work)
+    say("peak")
+    subject = {name: getattr(config, name) for name in ("preset", "env", "algo", "num_seeds")}
+    return Report(
+        subject | {"n_agents": training.env.spec.n_agents},
+        folder.versions() | {"device": jax.devices()[0].device_kind, "cores": n_cores()},
+        timings,
+        peaks(repeats),
+        compile_seconds,
+        peak_memory(),
+    )
+
+
+def parts_of(training: Training, states: TrainState) -> dict[str, Part]:
+    """What learning in imagination is made of, for all seeds at once; nothing without a model."""
+    algorithm, learner, replay = training.algorithm, states.learner, states.replay
+    if isinstance(algorithm, MAG):
+        algorithm, learner = algorithm.base, learner.base
+    if not isinstance(algorithm, ModelBased):
+        return {}
+    model: ModelBased = algorithm
+    sizes, key = model.config.world_model, states.key
+
+    def sample(replay: Replay, key: PRNGKey) -> Any:
+        return sample_sequences(replay, key, sizes.batch_size, sizes.batch_length)
+
+    def update_model(learner: Any, replay: Replay, key: PRNGKey) -> Any:
+        experience = Experience(replay, None, None)  # pyright: ignore[reportArgumentType]
+
+        def update(learner: Any, key: PRNGKey) -> Any:
+            return model.update_model(learner, experience, key)
+
+        return jax.lax.scan(update, learner, jax.random.split(key, UPDATES))
+
+    def update_behaviour(learner: Any, imagined: Any, key: PRNGKey) -> Any:
+        trajectory, replayed = imagined
+        return model.behaviour.update(learner.behaviour, trajectory, replayed, key)
+
+    imagine = Part(over_seeds(model.imagine), (learner, replay, key))
+    imagined = jax.jit(imagine.function)(*imagine.arguments)
+    return {
+        "replay sampling": Part(over_seeds(sample), (replay, key)),
+        "model update": Part(over_seeds(update_model), (learner, replay, key), UPDATES),
+        "imagination": imagine,
+        "behaviour update": Part(over_seeds(update_behaviour), (learner, imagined, key)),
+    }
+
+
+def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Of the one seed, or of all; arguments and results have an axis of seeds."""
+
+    def mapped(*arguments: Any) -> Any:
+        if len(jax.tree.leaves(arguments[-1])[0]) > 1:
+            return jax.vmap(function)(*arguments)
+        one = function(*jax.tree.map(lambda x: x[0], arguments))
+        return jax.tree.map(lambda x: x[None], one)
+
+    return mapped
+
+
+def timed(part: Part, repeats: int) -> Timing:
+    """Seconds of one time, after a call to warm up."""
+    compiled = jax.jit(part.function).lower(*part.arguments).compile()
+    memory = compiled.memory_analysis()
+    jax.block_until_ready(compiled(*part.arguments))
+    seconds = [clock(partial(compiled, *part.arguments)) / part.times for _ in range(repeats)]
+    temporary = int(memory.temp_size_in_bytes) if memory else 0
+    return Timing(seconds, flop_of(part) / part.times, temporary)
+
+
+def clock(function: Callable[[], Any]) -> float:
+    """Seconds until its result is there."""
+    start = time.perf_counter()
+    jax.block_until_ready(function())
+    return time.perf_counter() - start
+
+
+def flop_of(part: Part) -> float:
+    """Of one call."""
+    return flop(jax.make_jaxpr(part.function)(*part.arguments).jaxpr)
+
+
+def flop(jaxpr: Any) -> float:
+    """Of all matrix products in a program; loops without a known length count once."""
+    total = 0.0
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            contracted = equation.params["dimension_numbers"][0][0]
+            shape = equation.invars[0].aval.shape
+            total += 2 * prod(equation.outvars[0].aval.shape) * prod(shape[i] for i in contracted)
+        inner = sum(flop(each) for each in jaxprs_in_params(equation.params))
+        total += inner * equation.params.get("length", 1)
+    return total
+
+
+@contextmanager
+def without_cache() -> Iterator[None]:
+    """Programs are compiled, not read from where an earlier process left them."""
+    was = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
+    jax.config.update("jax_enable_compilation_cache", False)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_compilation_cache", was)
+
+
+def peaks(repeats: int) -> dict[str, float]:
+    """What the device does at best, measured here and now."""
+    found = {}
+    for kind in (jnp.float32, jnp.bfloat16):
+        ones = jnp.ones((PEAK_SIZE, PEAK_SIZE), kind)
+        product = jax.jit(partial(jnp.matmul, preferred_element_type=jnp.float32))
+        clock(partial(product, ones, ones))
+        fastest = min(clock(partial(product, ones, ones)) for _ in range(repeats))
+        found[jnp.dtype(kind).name] = 2 * PEAK_SIZE**3 / fastest
+    if jax.default_backend() != "cpu":
+        block = jnp.zeros(COPIED // 4, jnp.float32)
+        copy = jax.jit(lambda x: x + 1)
+        clock(partial(copy, block))
+        found["copy"] = 2 * COPIED / min(clock(partial(copy, block)) for _ in range(repeats))
+    return found
+
+
+def peak_memory() -> int:
+    """The most bytes that were in use so far."""
+    stats = jax.devices()[0].memory_stats() or {}
+    of_process = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return stats.get("peak_bytes_in_use") or of_process * (
+        1 if platform.system() == "Darwin" else 1024
+    )
+
+
+def read(path: Path) -> dict[str, Any]:
+    """What `Report.write` wrote. Raises UserError for anything else."""
+    try:
+        found = json.loads(path.read_text())
+        return found | {"timings": {k: v["median"] for k, v in found["timings"].items()}}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is no report of mabl bench --json: {error}") from error
+
+
+def table(report: Report, baseline: dict[str, Any] | None = None) -> Table:
+    """For people; with a baseline, how many times faster each part is than it was there."""
+    made = Table(box=None, title=title(report), caption=caption(report), title_justify="left")
+    made.caption_justify = "left"
+    headings = ["part", "median", "least", "greatest", "GFLOP", "GFLOP/s", "of peak", "temporary"]
+    for heading in headings + ["times as fast"] * (baseline is not None):
+        made.add_column(heading, justify="left" if heading == "part" else "right")
+    for name, timing in report.timings.items():
+        rate = timing.flop / timing.median
+        cells = [name, *(milliseconds(float(f(timing.seconds))) for f in (np.median, min, max))]
+        cells += [f"{timing.flop / 1e9:,.1f}", f"{rate / 1e9:,.0f}"] if rate else ["", ""]
+        cells.append(f"{rate / report.peak['float32']:.0%}" if rate else "")
+        cells.append(f"{timing.temporary / 2**20:,.0f} MiB" if timing.temporary else "")
+        if baseline is not None:
+            before = baseline["timings"].get(name)
+            cells.append(f"{before / timing.median:.2f}" if before else "-")
+        made.add_row(*cells)
+    return made
+
+
+def title(report: Report) -> str:
+    """What was run, and where."""
+    subject, on = report.subject, report.machine
+    seeds = "" if subject["num_seeds"] == 1 else f", {subject['num_seeds']} seeds"
+    return (
+        f"{subject['algo']} on {subject['env']} ({subject['n_agents']} agents{seeds}), preset "
+        f"{subject['preset']}; {on['device']}, {on['cores']} cores, jax {on['jax']}"
+    )
+
+
+def caption(report: Report) -> str:
+    """What is measured once."""
+    peak = ", ".join(
+        f"{kind} {rate / 1e9:,.0f} G{'B' if kind == 'copy' else 'FLOP'}/s"
+        for kind, rate in report.peak.items()
+    )
+    return (
+        f"peak: {peak}\ncompiling: {report.compile_seconds:.1f} s; most memory: "
+        f"{report.memory / 2**20:,.0f} MiB"
+    )
+
+
+def milliseconds(seconds: float) -> str:
+    """Three digits."""
+    return f"{1e3 * seconds:,.{max(0, 2 - int(np.floor(np.log10(1e3 * seconds))))}f} ms"
