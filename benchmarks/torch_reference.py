@@ -1,9 +1,10 @@
 """MABL's learning in plain eager PyTorch, written the obvious way: what `benchmarks.against_torch`
 measures ours against.
 
-Latents are one-hot floats, time is a Python loop, everything is float32. Agents share parameters,
-so that they are rows of the batch. The losses are ours to the letter, and `against_torch` checks
-that before it measures: with the weights and the samples of ours the loss and its gradients agree.
+Latents are one-hot floats, drawn with `torch.multinomial`, time is a Python loop, everything is
+float32. Agents share parameters, so that they are rows of the batch. The world model's loss is ours
+to the letter, and `against_torch` checks that before it measures: with the weights and the samples
+of ours the loss and its gradients agree. PPO is the same work, less the masks of the dead.
 """
 
 from dataclasses import dataclass
@@ -85,7 +86,12 @@ class WorldModel(nn.Module):
         onehot = F.one_hot(index, self.sizes.n_classes).to(probs.dtype)
         return (onehot + probs - probs.detach()).flatten(-2)
 
-    def observe(self, rows: dict[str, Tensor], forced: dict[str, Tensor] | None = None) -> Any:
+    def observe(
+        self,
+        rows: dict[str, Tensor],
+        forced: dict[str, Tensor] | None = None,
+        priors: bool = True,
+    ) -> Any:
         """Posterior latents `[B, T, N, ...]` of all rows, and the logits of posteriors and priors.
 
         `forced` holds indices `[B, T, N, K]` of samples: `agent`, `global`, `global_prior`.
@@ -118,9 +124,11 @@ class WorldModel(nn.Module):
             seen = state[:, t, None].expand(-1, n, -1)
             q_g = self.global_posterior(torch.cat([seen, z_a, h_g], -1))
             z_g = sample("global", q_g)
-            p_g = self.global_prior(h_g)
-            p_a = self.agent_prior(torch.cat([h_a, sample("global_prior", p_g)], -1))
-            found = dict(h_a=h_a, h_g=h_g, z_a=z_a, z_g=z_g, q_a=q_a, q_g=q_g, p_a=p_a, p_g=p_g)
+            found = dict(h_a=h_a, h_g=h_g, z_a=z_a, z_g=z_g, q_a=q_a, q_g=q_g)
+            if priors:
+                p_g = self.global_prior(h_g)
+                p_a = self.agent_prior(torch.cat([h_a, sample("global_prior", p_g)], -1))
+                found |= dict(p_a=p_a, p_g=p_g)
             for name, value in found.items():
                 out.setdefault(name, []).append(value)
         return {name: torch.stack(values, 1) for name, values in out.items()}
@@ -218,11 +226,12 @@ class Learner:
     def act(self, latent: dict[str, Tensor], available: Tensor) -> torch.distributions.Categorical:
         """The policy at latents."""
         logits = self.actor(torch.cat([latent["z_a"], latent["h_a"]], -1))
-        return torch.distributions.Categorical(logits=logits.masked_fill(~available, -1e9))
+        masked = logits.masked_fill(~available, -1e9)
+        return torch.distributions.Categorical(logits=masked, validate_args=False)
 
     def _imagined(self, rows: dict[str, Tensor]) -> dict[str, Tensor]:
         """PPO's rows `[M, N, ...]` with advantages and lambda-returns."""
-        seen = self.model.observe(rows)
+        seen = self.model.observe(rows, priors=False)
         latent = {name: seen[name].flatten(0, 1) for name in ("h_a", "h_g", "z_a", "z_g")}
         available = rows["available"].flatten(0, 1) > 0.5
         steps: list[dict[str, Tensor]] = []
@@ -244,7 +253,6 @@ class Learner:
             offered = self.model.available(full)[..., :-1].sigmoid()
             available = torch.rand_like(offered) < offered
             available |= ~available.any(-1, keepdim=True)
-            self.model.obs(agent), self.model.action(full)
             steps.append(now)
         value = [self.critic(step["critic"]) for step in steps] + [self.critic(self._full(latent))]
         target, weight = value[-1], torch.ones_like(value[0])
@@ -265,7 +273,7 @@ class Learner:
 
     def _ppo(self, batch: dict[str, Tensor]) -> None:
         logits = self.actor(batch["actor"]).masked_fill(~batch["available"], -1e9)
-        policy = torch.distributions.Categorical(logits=logits)
+        policy = torch.distributions.Categorical(logits=logits, validate_args=False)
         ratio = (policy.log_prob(batch["action"]) - batch["log_prob"]).exp()
         gain = torch.minimum(ratio * batch["advantage"], ratio.clamp(0.8, 1.2) * batch["advantage"])
         weight = batch["weight"] / batch["weight"].sum()

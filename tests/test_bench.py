@@ -23,6 +23,13 @@ def test_work_is_counted_by_hand():
     assert bench.flop(jax.make_jaxpr(jax.vmap(looped))(jnp.ones((2, 5, 3))).jaxpr) == 1680
     assert bench.flop(jax.make_jaxpr(lambda x: (x * x).sum())(x).jaxpr) == 0
 
+    def either(x):  # one product or two
+        return jax.lax.cond(x[0, 0] > 0, lambda x: x @ w, lambda x: (x @ w) @ w.T @ w, x)
+
+    assert bench.flop(jax.make_jaxpr(either)(x).jaxpr) == 630
+    wasted = bench.Part(lambda x: (x @ w, x)[1], (x,))
+    assert bench.flop_of(wasted) == 0  # nobody reads it
+
 
 @pytest.mark.parametrize("algo", ["mabl", "mag", "mappo"])
 def test_every_part_is_timed(algo):
@@ -75,10 +82,37 @@ def test_what_cannot_be_timed_is_said(tmp_path, mabl):
     arguments = ["bench", *flags("mabl", "test/coordination")]
     other = tmp_path / "other.json"
     other.write_text("{}")
+    odd = tmp_path / "odd.json"
+    odd.write_text('{"timings": []}')
     for wrong, message in (
         ("--repeats=0", "--repeats is 0: give a number above 0"),
         (f"--against={tmp_path / 'none.json'}", "is no report of mabl bench --json"),
         (f"--against={other}", "is no report of mabl bench --json"),
+        (f"--against={odd}", "is no report of mabl bench --json"),
+        (f"--json={tmp_path / 'none' / 'x.json'}", "there is no folder"),
+        (f"--json={tmp_path}", "is a folder: give a file"),
     ):
         code, _, err = mabl(*arguments, wrong)
         assert code == 2 and message in err and "Traceback" not in err
+
+
+def test_a_replay_smaller_than_the_prefill_is_filled():
+    config = tiny("mabl")
+    plan = replace(config.training, replay_capacity=90, prefill_steps=100)
+    report = bench.measure(replace(config, training=plan), 1, ("replay sampling",), str)
+    assert list(report.timings) == ["replay sampling"]
+
+
+def test_programs_are_compiled_and_not_read_from_the_cache():
+    events = []
+    jax.monitoring.register_event_listener(lambda name, **_: events.append(name))
+    hits, misses = (f"/jax/compilation_cache/cache_{kind}" for kind in ("hits", "misses"))
+    try:
+        for _ in range(2):
+            events.clear()
+            bench.measure(tiny("dreamer-v2"), 1, ("collection",), events.append)
+            compiling = events[events.index("compiling") : events.index("peak")]
+            assert hits not in compiling and misses not in compiling
+        assert {hits, misses} & set(events)  # the cache is on again
+    finally:
+        jax.monitoring.clear_event_listeners()

@@ -1,13 +1,12 @@
 """How long each part of a run takes, and how near that comes to what the machine can do.
 
-All parts are compiled as training compiles them, and run one after the other in one process. Work
+All parts run one after the other in one process. Work
 is the multiplications and additions of matrix products in the program as it is written: what an
 index saves in place of a one-hot vector is not in it.
 """
 
 import json
 import platform
-import resource
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,7 +18,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from jax.extend.core import jaxprs_in_params
+from jax.interpreters.partial_eval import dce_jaxpr
 from rich.table import Table
 
 from mabl.algorithms.base import Experience
@@ -31,13 +32,16 @@ from mabl.errors import UserError
 from mabl.replay import Replay, sample_sequences
 from mabl.runs import folder
 from mabl.training.loop import Training, TrainState
-from mabl.training.programs import build, programs
+from mabl.training.programs import build, forget_programs, programs
+from mabl.training.run import longest_lane
 from mabl.types import PRNGKey
 
 PEAK_SIZE = 2048
 """Rows and columns of the matrices whose product is the peak."""
 COPIED = 2**28
 """Bytes that are copied to measure an accelerator's bandwidth."""
+LEARNING = ("replay sampling", "model update", "imagination", "behaviour update")
+"""Parts of learning in imagination."""
 UPDATES = 5
 """Model updates in one call, as they follow each other in a cycle."""
 
@@ -72,7 +76,7 @@ class Report(NamedTuple):
     compile_seconds: float
     """Until a first cycle has collected: to trace and compile it, without a cache."""
     memory: int
-    """Most bytes in use: on the device, or of the process where that is the CPU."""
+    """Most bytes in use: on the device, or of this process where that is the CPU."""
 
     def write(self, path: Path) -> None:
         """As JSON."""
@@ -98,43 +102,53 @@ def measure(
 
     Raises UserError for a part that the algorithm does not have.
     """
+    forget_programs()
     training, run = build(config), programs(config)
     plan = training.algorithm.config.training
-    states = run.init(jax.random.split(jax.random.key(config.seed), config.num_seeds))
+    learning = LEARNING if model_based(training) else ()
+    known = ("collection", *learning, "cycle")
+    for name in names:
+        if name not in known:
+            raise UserError(f"{config.algo} has no part {name!r}: give {', '.join(known)}")
+    wanted = names or known
     timings: dict[str, Timing] = {}
     with run.open_cycle(config) as cycle, without_cache():
+        states = run.init(jax.random.split(jax.random.key(config.seed), config.num_seeds))
+
+        def cycles(states: TrainState, *counts: int) -> tuple[TrainState, Timing]:
+            """Each consumes the states that it is given."""
+            seconds = []
+            for _ in range(repeats + 1):
+                start = time.perf_counter()
+                states, _ = jax.block_until_ready(cycle(states, *counts))
+                seconds.append(time.perf_counter() - start)
+            return states, Timing(seconds[1:], 0.0, 0)
+
         say("compiling")
         start = time.perf_counter()
         states, _ = jax.block_until_ready(cycle(states, 0, 0))
         compile_seconds = time.perf_counter() - start
         say("filling the replay")
-        needed = max(plan.prefill_steps, training.algorithm.rows_needed * plan.num_envs)
-        while int(states.replay.size.sum(-1).min()) < needed:
+        while (
+            int(states.env_steps.min()) < plan.prefill_steps
+            or longest_lane(states) < training.algorithm.rows_needed
+        ):
             states, _ = cycle(states, 0, 0)
-        parts = parts_of(training, states)
-        known = ["collection", *parts, "cycle"]
-        for name in names:
-            if name not in known:
-                raise UserError(f"{config.algo} has no part {name!r}: give {', '.join(known)}")
-        for name in (name for name in known if name in (names or known)):
+        if "collection" in wanted:
+            say("collection")
+            states, timings["collection"] = cycles(states, 0, 0)
+        parts = parts_of(training, states) if learning else {}
+        for name in (name for name in learning if name in wanted):
             say(name)
-            if name in parts:
-                timings[name] = timed(parts[name], repeats)
-                continue
-            counts = (plan.model_updates, plan.policy_updates) if name == "cycle" else (0, 0)
-            seconds = []
-            for _ in range(repeats + 1):  # a cycle consumes the states that it is given
-                start = time.perf_counter()
-                states, _ = jax.block_until_ready(cycle(states, *counts))
-                seconds.append(time.perf_counter() - start)
-            timings[name] = Timing(seconds[1:], 0.0, 0)
-            parts = parts_of(training, states)
-    if "cycle" in timings and parts:
-        flop = {name: flop_of(part) / part.times for name, part in parts.items()}
-        work = plan.model_updates * flop["model update"] + plan.policy_updates * (
-            flop["imagination"] + flop["behaviour update"]
-        )
-        timings["cycle"] = timings["cycle"]._replace(flop=work)
+            timings[name] = timed(parts[name], repeats)
+        if "cycle" in wanted:
+            say("cycle")
+            flop = {name: flop_of(part) / part.times for name, part in parts.items()}
+            states, timing = cycles(states, plan.model_updates, plan.policy_updates)
+            work = plan.model_updates * flop.get("model update", 0.0) + plan.policy_updates * (
+                flop.get("imagination", 0.0) + flop.get("behaviour update", 0.0)
+            )
+            timings["cycle"] = timing._replace(flop=work)
     say("peak")
     subject = {name: getattr(config, name) for name in ("preset", "env", "algo", "num_seeds")}
     return Report(
@@ -147,15 +161,16 @@ def measure(
     )
 
 
+def model_based(training: Training) -> bool:
+    """Whether it learns in imagination."""
+    return isinstance(training.algorithm, ModelBased | MAG)
+
+
 def parts_of(training: Training, states: TrainState) -> dict[str, Part]:
-    """What learning in imagination is made of, for all seeds at once; nothing without a model."""
+    """`LEARNING`, for all seeds at once."""
     algorithm, learner, replay = training.algorithm, states.learner, states.replay
-    if isinstance(algorithm, MAG):
-        algorithm, learner = algorithm.base, learner.base
-    if not isinstance(algorithm, ModelBased):
-        return {}
-    model: ModelBased = algorithm
-    sizes, key = model.config.world_model, states.key
+    assert isinstance(algorithm, ModelBased | MAG)
+    sizes, key = algorithm.config.world_model, states.key
 
     def sample(replay: Replay, key: PRNGKey) -> Any:
         return sample_sequences(replay, key, sizes.batch_size, sizes.batch_length)
@@ -164,22 +179,23 @@ def parts_of(training: Training, states: TrainState) -> dict[str, Part]:
         experience = Experience(replay, None, None)  # pyright: ignore[reportArgumentType]
 
         def update(learner: Any, key: PRNGKey) -> Any:
-            return model.update_model(learner, experience, key)
+            return algorithm.update_model(learner, experience, key)
 
         return jax.lax.scan(update, learner, jax.random.split(key, UPDATES))
 
     def update_behaviour(learner: Any, imagined: Any, key: PRNGKey) -> Any:
         trajectory, replayed = imagined
-        return model.behaviour.update(learner.behaviour, trajectory, replayed, key)
+        return algorithm.learn(learner, trajectory, replayed, key)
 
-    imagine = Part(over_seeds(model.imagine), (learner, replay, key))
+    imagine = Part(over_seeds(algorithm.imagine), (learner, replay, key))
     imagined = jax.jit(imagine.function)(*imagine.arguments)
-    return {
-        "replay sampling": Part(over_seeds(sample), (replay, key)),
-        "model update": Part(over_seeds(update_model), (learner, replay, key), UPDATES),
-        "imagination": imagine,
-        "behaviour update": Part(over_seeds(update_behaviour), (learner, imagined, key)),
-    }
+    parts = (
+        Part(over_seeds(sample), (replay, key)),
+        Part(over_seeds(update_model), (learner, replay, key), UPDATES),
+        imagine,
+        Part(over_seeds(update_behaviour), (learner, imagined, key)),
+    )
+    return dict(zip(LEARNING, parts, strict=True))
 
 
 def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -212,19 +228,22 @@ def clock(function: Callable[[], Any]) -> float:
 
 
 def flop_of(part: Part) -> float:
-    """Of one call."""
-    return flop(jax.make_jaxpr(part.function)(*part.arguments).jaxpr)
+    """Of one call, less what nobody reads."""
+    jaxpr = jax.make_jaxpr(part.function)(*part.arguments).jaxpr
+    return flop(dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[0])
 
 
 def flop(jaxpr: Any) -> float:
-    """Of all matrix products in a program; loops without a known length count once."""
+    """Of all matrix products in a program, the dearest branch of each choice; loops without a known
+    length count once."""
     total = 0.0
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
             contracted = equation.params["dimension_numbers"][0][0]
             shape = equation.invars[0].aval.shape
             total += 2 * prod(equation.outvars[0].aval.shape) * prod(shape[i] for i in contracted)
-        inner = sum(flop(each) for each in jaxprs_in_params(equation.params))
+        each = [flop(inner) for inner in jaxprs_in_params(equation.params)]
+        inner = max(each) if equation.primitive.name == "cond" else sum(each)
         total += inner * equation.params.get("length", 1)
     return total
 
@@ -234,10 +253,12 @@ def without_cache() -> Iterator[None]:
     """Programs are compiled, not read from where an earlier process left them."""
     was = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_compilation_cache", False)
+    reset_cache()  # JAX remembers whether there is one
     try:
         yield
     finally:
         jax.config.update("jax_enable_compilation_cache", was)
+        reset_cache()
 
 
 def peaks(repeats: int) -> dict[str, float]:
@@ -259,6 +280,8 @@ def peaks(repeats: int) -> dict[str, float]:
 
 def peak_memory() -> int:
     """The most bytes that were in use so far."""
+    import resource  # which not every system has
+
     stats = jax.devices()[0].memory_stats() or {}
     of_process = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return stats.get("peak_bytes_in_use") or of_process * (
@@ -271,7 +294,7 @@ def read(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text())
         return found | {"timings": {k: v["median"] for k, v in found["timings"].items()}}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is no report of mabl bench --json: {error}") from error
 
 
@@ -312,8 +335,8 @@ def caption(report: Report) -> str:
         for kind, rate in report.peak.items()
     )
     return (
-        f"peak: {peak}\ncompiling: {report.compile_seconds:.1f} s; most memory: "
-        f"{report.memory / 2**20:,.0f} MiB"
+        f"peak: {peak}\ncompiling, and a first collection: {report.compile_seconds:.1f} s; "
+        f"most memory: {report.memory / 2**20:,.0f} MiB"
     )
 
 

@@ -301,6 +301,10 @@ def bench(arguments: list[str]) -> int:
     config, given = parse_with_config(rest, default, "mabl bench", bench.__doc__, *BENCH)
     if given.repeats < 1:
         raise UserError(f"--repeats is {given.repeats}: give a number above 0")
+    if given.json and not given.json.parent.is_dir():
+        raise UserError(f"--json {given.json}: there is no folder {given.json.parent}")
+    if given.json and given.json.is_dir():
+        raise UserError(f"--json {given.json} is a folder: give a file")
     from mabl import bench as benchmark
 
     baseline = benchmark.read(given.against) if given.against else None

@@ -16,7 +16,7 @@ from mabl.execution import Policy
 from mabl.imagination import Dream, Imagined
 from mabl.nets.mlp import MLP, Features, parts_of, widths_of
 from mabl.replay import Replay, sample_sequences
-from mabl.types import Metrics, PRNGKey
+from mabl.types import Metrics, PRNGKey, Replayed, Trajectory
 from mabl.world_models.base import decoder_losses, kl_losses, observe_batch
 from mabl.world_models.heads import Predictions
 from mabl.world_models.mamba import Team
@@ -103,13 +103,27 @@ class MAG(NamedTuple):
         self, learner: LookaheadLearner, experience: Experience, key: PRNGKey
     ) -> tuple[LookaheadLearner, Metrics]:
         """As without lookahead, but for how imagination goes on."""
+        key_imagine, key_learn = jax.random.split(key)
+        imagined = self.imagine(learner, experience.replay, key_imagine)
+        return self.learn(learner, *imagined, key_learn)
+
+    def imagine(
+        self, learner: LookaheadLearner, replay: Replay, key: PRNGKey
+    ) -> tuple[Trajectory, Replayed]:
+        """Trajectories of chosen candidates, and the sequences that they began in."""
 
         def step(
             dream: Dream, state: Imagined, action: Array, key: PRNGKey
         ) -> tuple[Imagined, Predictions]:
             return best_candidate(dream, learner.error, self.config.lookahead, state, action, key)
 
-        base, metrics = self.base.update_policy(learner.base, experience, key, step)
+        return self.base.imagine(learner.base, replay, key, step)
+
+    def learn(
+        self, learner: LookaheadLearner, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
+    ) -> tuple[LookaheadLearner, Metrics]:
+        """Train the policy on trajectories."""
+        base, metrics = self.base.learn(learner.base, trajectory, replayed, key)
         return learner._replace(base=base), metrics
 
     def diagnose(self, learner: LookaheadLearner, replay: Replay, key: PRNGKey) -> Metrics:

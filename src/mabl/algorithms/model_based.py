@@ -79,15 +79,12 @@ class ModelBased(NamedTuple):
         return learner._replace(model=model, model_opt=model_opt), metrics
 
     def update_policy(
-        self, learner: Learner, experience: Experience, key: PRNGKey, step: Step = Dream.step
+        self, learner: Learner, experience: Experience, key: PRNGKey
     ) -> tuple[Learner, Metrics]:
         """Draw B_R sequences, imagine from their latents, train theta and phi (lines 10-13)."""
         key_imagine, key_learn = jax.random.split(key)
-        trajectory, replayed = self.imagine(learner, experience.replay, key_imagine, step)
-        behaviour, metrics = self.behaviour.update(
-            learner.behaviour, trajectory, replayed, key_learn
-        )
-        return learner._replace(behaviour=behaviour), metrics
+        imagined = self.imagine(learner, experience.replay, key_imagine)
+        return self.learn(learner, *imagined, key_learn)
 
     def imagine(
         self, learner: Learner, replay: Replay, key: PRNGKey, step: Step = Dream.step
@@ -106,6 +103,13 @@ class ModelBased(NamedTuple):
             latents, rows.available, rows.alive
         )
         return trajectory, Replayed(view, rows)
+
+    def learn(
+        self, learner: Learner, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
+    ) -> tuple[Learner, Metrics]:
+        """Train theta and phi on trajectories (lines 12-13)."""
+        behaviour, metrics = self.behaviour.update(learner.behaviour, trajectory, replayed, key)
+        return learner._replace(behaviour=behaviour), metrics
 
     def diagnose(self, learner: Learner, replay: Replay, key: PRNGKey) -> Metrics:
         """How well the world model predicts sequences of the replay, and what is expected of them.
