@@ -179,9 +179,9 @@ def test_paper_presets_learn_for_a_cycle(task, steps):
     assert (config.training.model_updates, config.world_model.batch_length) == (40, 50)
     assert config.world_model.hidden == config.mappo.hidden == 400
     states = learn_a_cycle(config, replay_capacity=1_000)
-    z_global = SIZES["world_model"]["n_categoricals"] * SIZES["world_model"]["n_classes"]
-    critic = jax.tree.leaves(states.learner.behaviour.critic)
-    assert any(leaf.shape[1:2] == (z_global,) for leaf in critic)
+    z_global = SIZES["world_model"]["n_categoricals"], SIZES["world_model"]["n_classes"]
+    seen = states.learner.behaviour.critic.embed.weight  # of seeds, then of the one part that it sees
+    assert seen.shape == (1, *z_global, SIZES["mappo"]["hidden"])
 
 
 def test_another_version_is_named(monkeypatch):

@@ -2,7 +2,7 @@
 
 A state is a `Code`: the index of each variable's class, in place of K C zeros and ones. What a
 network's first layer makes of it is then a sum of K rows of its weights, not a product with a
-matrix, and a trajectory of states takes little memory ([docs/results/performance.md]).
+matrix, and a trajectory of states takes little memory (docs/results/performance.md).
 """
 
 from typing import Any, NamedTuple, TypeVar
