@@ -180,7 +180,7 @@ def test_paper_presets_learn_for_a_cycle(task, steps):
     assert config.world_model.hidden == config.mappo.hidden == 400
     states = learn_a_cycle(config, replay_capacity=1_000)
     z_global = SIZES["world_model"]["n_categoricals"], SIZES["world_model"]["n_classes"]
-    seen = states.learner.behaviour.critic.embed.weight  # of seeds, then of the one part that it sees
+    seen = states.learner.behaviour.critic.embed.weight  # with an axis of seeds
     assert seen.shape == (1, *z_global, SIZES["mappo"]["hidden"])
 
 
