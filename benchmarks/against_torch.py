@@ -56,10 +56,10 @@ def paired(ours: MABL, theirs: WorldModel) -> list[tuple[str, np.ndarray, torch.
     def recurrent(name: str, part: Any, twin: Any) -> None:
         linear(f"{name}.inputs", part.inputs, twin.inputs)
         cell, of = part.cell, twin.cell
-        pairs.append((f"{name}.ih", np.asarray(cell.weight_ih), of.weight_ih))
-        pairs.append((f"{name}.hh", np.asarray(cell.weight_hh), of.weight_hh))
+        pairs.append((f"{name}.ih", np.asarray(cell.weight_in).T, of.weight_ih))
+        pairs.append((f"{name}.hh", np.asarray(cell.weight_hidden).T, of.weight_hh))
         pairs.append((f"{name}.bias", np.asarray(cell.bias), of.bias_ih))
-        bias_hh = np.concatenate([np.zeros(2 * len(cell.bias_n)), cell.bias_n])
+        bias_hh = np.concatenate([np.zeros(2 * len(cell.bias_new)), cell.bias_new])
         pairs.append((f"{name}.bias_n", bias_hh.astype(np.float32), of.bias_hh))
 
     nets, heads = ours.nets, ours.nets.heads

@@ -29,6 +29,7 @@ from mabl.algorithms.mag import MAG
 from mabl.algorithms.model_based import ModelBased
 from mabl.envs.workers import n_cores
 from mabl.errors import UserError
+from mabl.nets.product import in_precision
 from mabl.replay import Replay, sample_sequences
 from mabl.runs import folder
 from mabl.training.loop import Training, TrainState
@@ -150,7 +151,9 @@ def measure(
             )
             timings["cycle"] = timing._replace(flop=work)
     say("peak")
-    subject = {name: getattr(config, name) for name in ("preset", "env", "algo", "num_seeds")}
+    subject = {
+        name: getattr(config, name) for name in ("preset", "env", "algo", "precision", "num_seeds")
+    }
     return Report(
         subject | {"n_agents": training.env.spec.n_agents},
         folder.versions() | {"device": jax.devices()[0].device_kind, "cores": n_cores()},
@@ -187,13 +190,18 @@ def parts_of(training: Training, states: TrainState) -> dict[str, Part]:
         trajectory, replayed = imagined
         return algorithm.learn(learner, trajectory, replayed, key)
 
-    imagine = Part(over_seeds(algorithm.imagine), (learner, replay, key))
+    def part(function: Callable[..., Any], *arguments: Any, times: int = 1) -> Part:
+        return Part(
+            in_precision(algorithm.config.precision, over_seeds(function)), arguments, times
+        )
+
+    imagine = part(algorithm.imagine, learner, replay, key)
     imagined = jax.jit(imagine.function)(*imagine.arguments)
     parts = (
-        Part(over_seeds(sample), (replay, key)),
-        Part(over_seeds(update_model), (learner, replay, key), UPDATES),
+        part(sample, replay, key),
+        part(update_model, learner, replay, key, times=UPDATES),
         imagine,
-        Part(over_seeds(update_behaviour), (learner, imagined, key)),
+        part(update_behaviour, learner, imagined, key),
     )
     return dict(zip(LEARNING, parts, strict=True))
 
@@ -238,12 +246,14 @@ def flop(jaxpr: Any) -> float:
     length count once."""
     total = 0.0
     for equation in jaxpr.eqns:
-        if equation.primitive.name == "dot_general":
-            contracted = equation.params["dimension_numbers"][0][0]
+        name = equation.primitive.name
+        if name in ("dot_general", "product"):
             shape = equation.invars[0].aval.shape
-            total += 2 * prod(equation.outvars[0].aval.shape) * prod(shape[i] for i in contracted)
+            last = (len(shape) - 1,)
+            summed = equation.params["dimension_numbers"][0][0] if name == "dot_general" else last
+            total += 2 * prod(equation.outvars[0].aval.shape) * prod(shape[i] for i in summed)
         each = [flop(inner) for inner in jaxprs_in_params(equation.params)]
-        inner = max(each) if equation.primitive.name == "cond" else sum(each)
+        inner = max(each) if name == "cond" else sum(each)
         total += inner * equation.params.get("length", 1)
     return total
 
@@ -324,7 +334,8 @@ def title(report: Report) -> str:
     seeds = "" if subject["num_seeds"] == 1 else f", {subject['num_seeds']} seeds"
     return (
         f"{subject['algo']} on {subject['env']} ({subject['n_agents']} agents{seeds}), preset "
-        f"{subject['preset']}; {on['device']}, {on['cores']} cores, jax {on['jax']}"
+        f"{subject['preset']}, {subject['precision']}; {on['device']}, {on['cores']} cores, "
+        f"jax {on['jax']}"
     )
 
 

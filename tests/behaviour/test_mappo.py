@@ -335,6 +335,11 @@ def test_the_entropy_bonus_alone_makes_the_policy_more_uniform(fresh):
     assert entropy(moved) > entropy(fresh.actor)
 
 
+def as_good_as_same(a, b):
+    """But for rounding, which Adam makes larger where a gradient is zero but for rounding."""
+    jax.tree.map(lambda x, y: assert_allclose(x, y, rtol=0, atol=2e-4), a, b)
+
+
 def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fresh):
     trajectory = random_trajectory(3, 4)
     view = some_view(6, 2)._replace(critic_features=jnp.ones((6, 2, 7)))
@@ -353,11 +358,11 @@ def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fres
         updated(0.0, real),
     )
     assert same(plain.actor, taught.actor)
-    assert same(plain.critic, deaf.critic)
+    as_good_as_same(plain.critic, deaf.critic)
     assert (value(taught) > value(plain)).all()
     assert metrics["behaviour/replay_critic_loss"] > 10  # 0.5 (9 - about 0)^2, falling
     nothing = real._replace(weight=jnp.zeros((6, 2)))
-    assert same(plain.critic, updated(1.0, nothing)[0].critic)
+    as_good_as_same(plain.critic, updated(1.0, nothing)[0].critic)
 
 
 @pytest.mark.parametrize(("value_decay", "learned"), [(0.9, True), (1.0, False)])

@@ -35,12 +35,12 @@ def test_recurrent_is_a_textbook_gru_behind_a_relu_layer():
     inputs, cell = jax.tree.map(np.asarray, (recurrent.inputs, recurrent.cell))
     weight = np.concatenate([block.reshape(-1, 4) for block in inputs.weight])
     x = np.maximum(np.concatenate([z, action]) @ weight + inputs.bias, 0)
-    w_reset, w_keep, w_new = np.split(cell.weight_ih, 3)
-    u_reset, u_keep, u_new = np.split(cell.weight_hh, 3)
+    w_reset, w_keep, w_new = np.split(cell.weight_in.T, 3)
+    u_reset, u_keep, u_new = np.split(cell.weight_hidden.T, 3)
     b_reset, b_keep, b_new = np.split(cell.bias, 3)
     reset = sigmoid(w_reset @ x + u_reset @ h + b_reset)
     keep = sigmoid(w_keep @ x + u_keep @ h + b_keep)
-    new = np.tanh(w_new @ x + b_new + reset * (u_new @ h + cell.bias_n))
+    new = np.tanh(w_new @ x + b_new + reset * (u_new @ h + cell.bias_new))
     expected = (1 - keep) * new + keep * h
 
     level = Level(h=jnp.asarray(h), z=code(2, 0, n_classes=3))

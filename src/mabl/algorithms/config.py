@@ -12,6 +12,7 @@ from mabl.behaviour.qmix import QMIXConfig
 from mabl.behaviour.recurrent import RecurrentMAPPOConfig
 from mabl.errors import UserError, require_between, require_positive, unknown_name
 from mabl.imagination import ImaginationConfig
+from mabl.nets.product import Precision
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.mamba import CommunicationConfig
 
@@ -101,6 +102,8 @@ class Config:
     """How many workers; 0: the learner's own process; None: one for each core."""
     worker_timeout: float = 60.0
     """Seconds that they may take for a step or a reset before they are replaced."""
+    precision: Precision = "float32"
+    """Of the operands of matrix products; sums, losses and parameters are float32."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
     communication: CommunicationConfig = field(default_factory=CommunicationConfig)

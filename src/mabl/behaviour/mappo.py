@@ -216,7 +216,8 @@ def experience(
     """Lambda-returns and advantages of trajectories, flattened to joint rows."""
     weight, reward = trajectory.weight, shared_reward(trajectory.reward, config.team_reward)
     view = trajectory.view
-    value = jax.vmap(jax.vmap(critic))(view.critic_features)
+    # Row by row of the horizon: the networks in between take more memory than all they see.
+    value = jax.lax.map(jax.vmap(critic), view.critic_features)
     target = lambda_returns(
         reward, config.gamma * trajectory.continues, value[1:], config.gae_lambda
     )

@@ -15,6 +15,7 @@ from mabl.behaviour.actor import Choice
 from mabl.behaviour.base import ActorFunction
 from mabl.behaviour.mappo import PPORows, policy_loss, weighted_mean
 from mabl.errors import UserError, require_between, require_positive
+from mabl.nets.gru import GRU
 from mabl.nets.mlp import Linear
 from mabl.nets.normaliser import Normaliser
 from mabl.types import Metrics, PRNGKey, TeamView
@@ -89,7 +90,7 @@ class RecurrentFilter(eqx.Module):
     norm_in: eqx.nn.LayerNorm
     layers: list[Linear]
     norms: list[eqx.nn.LayerNorm]
-    cell: eqx.nn.GRUCell
+    cell: GRU
     norm_out: eqx.nn.LayerNorm
     obs_dim: int = eqx.field(static=True)
     hidden: int = eqx.field(static=True)
@@ -100,7 +101,7 @@ class RecurrentFilter(eqx.Module):
         self.norm_in = eqx.nn.LayerNorm(obs_dim)
         self.layers = [Linear(obs_dim, hidden, key_in), Linear(hidden, hidden, key_hidden)]
         self.norms = [eqx.nn.LayerNorm(hidden) for _ in self.layers]
-        self.cell = eqx.nn.GRUCell(hidden, hidden, key=key_cell)
+        self.cell = GRU(hidden, hidden, key_cell)
         self.norm_out = eqx.nn.LayerNorm(hidden)
 
     def initial(self) -> Float[Array, " D"]:

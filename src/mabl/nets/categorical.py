@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from einops import rearrange
 from jaxtyping import Array, Float, Int
 
+from mabl.nets.product import product, product_with_transposed
 from mabl.types import PRNGKey
 
 Tree = TypeVar("Tree")
@@ -54,7 +55,7 @@ class Code(eqx.Module):
     def times(self, weight: Float[Array, "K C O"]) -> Float[Array, "*b O"]:
         """The vector times a matrix whose rows `weight` holds by variable and class."""
         if jax.default_backend() != "cpu":
-            return self.onehot() @ weight.reshape(-1, weight.shape[-1])
+            return product(self.onehot(), weight.reshape(-1, weight.shape[-1]))
         total = _sum_of_rows(self.index, weight)
         if self.tilt is None:
             return total
@@ -105,7 +106,7 @@ def _gradient_alone_fwd(tilt: Array, weight: Array) -> tuple[Array, Array]:
 
 
 def _gradient_alone_bwd(weight: Array, gradient: Array) -> tuple[Array, None]:
-    flat = gradient @ weight.reshape(-1, weight.shape[-1]).T
+    flat = product_with_transposed(gradient, weight.reshape(-1, weight.shape[-1]))
     return rearrange(flat, "... (k c) -> ... k c", c=weight.shape[1]), None
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mabl.nets.categorical import Code, CodeShape
+from mabl.nets.product import product
 from mabl.types import PRNGKey
 
 Part = Float[Array, "*b _"] | Code
@@ -64,7 +65,7 @@ class Linear(eqx.Module):
         total = self.bias
         blocks = self.weight if isinstance(self.weight, tuple) else (self.weight,)
         for part, block in zip(parts, blocks, strict=True):
-            total = total + (part.times(block) if isinstance(part, Code) else part @ block)
+            total = total + (part.times(block) if isinstance(part, Code) else product(part, block))
         return total
 
 

@@ -12,6 +12,7 @@ from mabl.algorithms import registry as algorithms
 from mabl.algorithms.config import Config
 from mabl.envs import registry as envs
 from mabl.envs.host import Hosted
+from mabl.nets.product import in_precision
 from mabl.training.hosting import Cycle, hosted_cycle
 from mabl.training.loop import Training, TrainState
 from mabl.types import Metrics
@@ -69,15 +70,17 @@ def _programs(config: Config, *registered: Any) -> Programs:
         training,
         init=jax.jit(jax.vmap(training.init)),
         open_cycle=_open_cycle(training, config.num_seeds),
-        diagnose=_over_seeds(diagnose, config.num_seeds),
+        diagnose=_over_seeds(in_precision(config.precision, diagnose), config.num_seeds),
     )
 
 
 def _open_cycle(training: Training, n_seeds: int) -> Callable[[Config], Any]:
+    precision = training.algorithm.config.precision
     if isinstance(training.env, Hosted):
-        learn = _over_seeds(training.learn, n_seeds, n_states=3, donate=True)
+        learn = in_precision(precision, training.learn)
+        learn = _over_seeds(learn, n_seeds, n_states=3, donate=True)
         return hosted_cycle(training, learn, n_seeds)
-    cycle = _over_seeds(training.cycle, n_seeds, donate=True)
+    cycle = _over_seeds(in_precision(precision, training.cycle), n_seeds, donate=True)
     return lambda config: nullcontext(cycle)
 
 

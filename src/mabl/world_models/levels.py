@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mabl.nets.categorical import Code, CodeShape, draw, still, unflatten
+from mabl.nets.gru import GRU
 from mabl.nets.mlp import MLP, Features, Linear, Part, Widths
 from mabl.types import PRNGKey
 
@@ -34,12 +35,12 @@ class Recurrent(eqx.Module):
     """Recurrent model h_t = f(h_{t-1}, z_{t-1}, a_{t-1}): a GRU behind one ReLU layer."""
 
     inputs: Linear
-    cell: eqx.nn.GRUCell
+    cell: GRU
 
     def __init__(self, latent: CodeShape, action_dim: int, hidden: int, key: PRNGKey):
         key_inputs, key_cell = jax.random.split(key)
         self.inputs = Linear((latent, action_dim), hidden, key_inputs)
-        self.cell = eqx.nn.GRUCell(hidden, hidden, key=key_cell)
+        self.cell = GRU(hidden, hidden, key_cell)
 
     def __call__(self, level: Level, action: Float[Array, " A"]) -> Float[Array, " D"]:
         """One step; `action` is encoded, the agent's own or the joint one."""

@@ -17,6 +17,7 @@ from mabl.envs.base import EnvSpec
 from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.attention import TransformerEncoder
 from mabl.nets.categorical import CodeShape, draw, still
+from mabl.nets.gru import GRU
 from mabl.nets.mlp import MLP, Features, Linear
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
@@ -82,7 +83,7 @@ class FilterNets(eqx.Module):
     encoder: MLP
     inputs: Linear
     communication: TransformerEncoder
-    cell: eqx.nn.GRUCell
+    cell: GRU
     posterior: Categoricals
 
     def __init__(
@@ -99,7 +100,7 @@ class FilterNets(eqx.Module):
         self.communication = TransformerEncoder(
             hidden, communication.n_layers, communication.n_heads, communication.dropout, keys[2]
         )
-        self.cell = eqx.nn.GRUCell(hidden, hidden, key=keys[3])
+        self.cell = GRU(hidden, hidden, keys[3])
         self.posterior = Categoricals((hidden, hidden), hidden, latent, keys[4])
 
     def listen(
