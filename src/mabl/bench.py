@@ -27,13 +27,13 @@ from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
 from mabl.algorithms.mag import MAG
 from mabl.algorithms.model_based import ModelBased
+from mabl.devices import SEEDS
 from mabl.envs.workers import n_cores
 from mabl.errors import UserError
-from mabl.nets.product import in_precision
 from mabl.replay import Replay, sample_sequences
 from mabl.runs import folder
 from mabl.training.loop import Training, TrainState
-from mabl.training.programs import build, forget_programs, programs
+from mabl.training.programs import as_in_a_run, build, forget_programs, programs
 from mabl.training.run import longest_lane
 from mabl.types import PRNGKey
 
@@ -114,7 +114,8 @@ def measure(
     wanted = names or known
     timings: dict[str, Timing] = {}
     with run.open_cycle(config) as cycle, without_cache():
-        states = run.init(jax.random.split(jax.random.key(config.seed), config.num_seeds))
+        keys = jax.random.split(jax.random.key(config.seed), config.num_seeds)
+        states = run.place(run.init(keys))
 
         def cycles(states: TrainState, *counts: int) -> tuple[TrainState, Timing]:
             """Each consumes the states that it is given."""
@@ -191,9 +192,7 @@ def parts_of(training: Training, states: TrainState) -> dict[str, Part]:
         return algorithm.learn(learner, trajectory, replayed, key)
 
     def part(function: Callable[..., Any], *arguments: Any, times: int = 1) -> Part:
-        return Part(
-            in_precision(algorithm.config.precision, over_seeds(function)), arguments, times
-        )
+        return Part(as_in_a_run(over_seeds(function), algorithm.config), arguments, times)
 
     imagine = part(algorithm.imagine, learner, replay, key)
     imagined = jax.jit(imagine.function)(*imagine.arguments)
@@ -211,7 +210,7 @@ def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def mapped(*arguments: Any) -> Any:
         if len(jax.tree.leaves(arguments[-1])[0]) > 1:
-            return jax.vmap(function)(*arguments)
+            return jax.vmap(function, spmd_axis_name=SEEDS)(*arguments)
         one = function(*jax.tree.map(lambda x: x[0], arguments))
         return jax.tree.map(lambda x: x[None], one)
 

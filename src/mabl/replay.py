@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from mabl.devices import spread
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 
@@ -65,4 +66,4 @@ def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int)
     age = pick - (ends - starts)[lane]
     oldest = (replay.cursor - replay.size)[lane]
     index = ((oldest + age)[:, None] + jnp.arange(length)[None]) % capacity
-    return jax.tree.map(lambda x: x[lane[:, None], index], replay.rows)
+    return spread(jax.tree.map(lambda x: x[lane[:, None], index], replay.rows))

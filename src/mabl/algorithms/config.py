@@ -94,6 +94,8 @@ class Config:
     """Decides everything random."""
     num_seeds: int = 1
     """Train seeds `seed .. seed + K - 1` in one program, each in its own run folder."""
+    num_devices: int = 1
+    """Accelerators to use: seeds are spread over them, and batches where there are fewer seeds."""
     logdir: str = "runs"
     """Where run folders go: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP."""
     workers: Literal["processes", "ray"] = "processes"
@@ -119,7 +121,7 @@ class Config:
         return [f.name for f in fields(cls) if is_dataclass(f.type)]
 
     def __post_init__(self) -> None:
-        require_positive(self, "total_steps", "num_seeds", "worker_timeout")
+        require_positive(self, "total_steps", "num_seeds", "num_devices", "worker_timeout")
         require_between(self, 0, inf, "num_workers")
         require_between(self, 0, 2**32 - self.num_seeds, "seed")
 

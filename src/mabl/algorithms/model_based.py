@@ -14,6 +14,7 @@ from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
 from mabl.algorithms.diagnostics import DIAGNOSED_ROWS, diagnose, masked_mean
 from mabl.behaviour.base import Behaviour
+from mabl.devices import spread
 from mabl.envs.base import EnvSpec
 from mabl.execution import Policy
 from mabl.imagination import Dream, Imagined, Step, imagine_trajectory
@@ -94,7 +95,7 @@ class ModelBased(NamedTuple):
         key_sample, key_observe, key_start, key_imagine = jax.random.split(key, 4)
         rows = sample_sequences(replay, key_sample, sizes.batch_size, sizes.batch_length)
         latents = self._observe(learner, rows, key_observe)
-        start, weight = starts(latents, rows, key_start, self.config.imagination.n_starts)
+        start, weight = spread(starts(latents, rows, key_start, self.config.imagination.n_starts))
         dream = self.dream(learner)
         trajectory = jax.vmap(
             lambda *start: imagine_trajectory(dream, *start, step=step), out_axes=1

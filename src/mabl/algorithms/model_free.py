@@ -13,7 +13,7 @@ from jaxtyping import Array
 from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
 from mabl.behaviour.actor import actor_for
-from mabl.behaviour.base import minibatches
+from mabl.behaviour.base import minibatch_of, minibatches
 from mabl.behaviour.critic import Critic
 from mabl.behaviour.mappo import PPORows, real_returns, weighted_mean
 from mabl.behaviour.recurrent import (
@@ -132,7 +132,7 @@ class ModelFree:
         optimiser = self._optimiser()
 
         def minibatch(learner: PolicyLearner, index: Array) -> tuple[PolicyLearner, Metrics]:
-            batch = jax.tree.map(lambda x: x[index], chunks)
+            batch = minibatch_of(chunks, index)
             policy_grad, policy_metrics = eqx.filter_grad(recurrent_policy_loss, has_aux=True)(
                 learner.policy, batch, jnp.float32(config.ent_coef), config.clip
             )

@@ -8,11 +8,13 @@ from einops import rearrange
 from jaxtyping import Array, Bool, Float, Int
 
 from mabl.behaviour.actor import Choice
+from mabl.devices import spread
 from mabl.envs.base import ActionSpace
 from mabl.nets.mlp import Features
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 
 S = TypeVar("S")
+Rows = TypeVar("Rows")
 
 ActorFunction = Callable[[Features, Bool[Array, " A"]], Choice]
 """A policy: one agent's features and available actions to a choice; a pytree of its parameters."""
@@ -60,3 +62,8 @@ def minibatches(key: PRNGKey, n_rows: int, batch_size: int, n_epochs: int) -> In
         return rearrange(order, "(m b) -> m b", b=size)
 
     return rearrange(jax.vmap(shuffled)(jax.random.split(key, n_epochs)), "e m b -> (e m) b")
+
+
+def minibatch_of(rows: Rows, index: Int[Array, " B"]) -> Rows:
+    """The rows that one of `minibatches` names."""
+    return spread(jax.tree.map(lambda x: x[index], rows))

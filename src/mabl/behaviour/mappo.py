@@ -13,7 +13,7 @@ from einops import rearrange
 from jaxtyping import Array, Float
 
 from mabl.behaviour.actor import Actor, Choice, ContinuousActor, actor_for
-from mabl.behaviour.base import ActorFunction, minibatches
+from mabl.behaviour.base import ActorFunction, minibatch_of, minibatches
 from mabl.behaviour.critic import Critic
 from mabl.envs.base import ActionSpace
 from mabl.errors import UserError, require_between, require_positive
@@ -350,7 +350,7 @@ def update(
         return loss, metrics
 
     def minibatch(state: ActorCritic, index: Array) -> tuple[ActorCritic, Metrics]:
-        batch = jax.tree.map(lambda x: x[index], rows)
+        batch = minibatch_of(rows, index)
         actor_grad, actor_metrics = eqx.filter_grad(actor_loss, has_aux=True)(
             state.actor, batch, state.ent_coef, config.clip
         )

@@ -11,7 +11,7 @@ from einops import rearrange
 from jaxtyping import Array, Bool, Float, Int
 
 from mabl.behaviour.actor import MaskedCategorical
-from mabl.behaviour.base import minibatches
+from mabl.behaviour.base import minibatch_of, minibatches
 from mabl.envs.base import ActionSpace
 from mabl.errors import require_between, require_positive
 from mabl.losses.returns import lambda_returns
@@ -192,7 +192,7 @@ class QMIX(NamedTuple):
         batches = minibatches(key, rows.target.shape[0], config.batch_size, config.n_epochs)
 
         def minibatch(state: QState, index: Array) -> tuple[QState, Metrics]:
-            batch = jax.tree.map(lambda x: x[index], rows)
+            batch = minibatch_of(rows, index)
             gradient, metrics = eqx.filter_grad(td_loss, has_aux=True)(state.values, batch)
             step, opt = optimiser(config).update(gradient, state.opt)
             values = eqx.apply_updates(state.values, step)
@@ -230,7 +230,7 @@ def experience(state: QState, trajectory: Trajectory, config: QMIXConfig) -> tup
     target = lambda_returns(
         reward,
         config.gamma * trajectory.continues.mean(-1),
-        jax.vmap(jax.vmap(next_value))(ahead),
+        jax.lax.map(jax.vmap(next_value), ahead),
         config.td_lambda,
     )
     view = jax.tree.map(lambda x: x[:-1], trajectory.view)

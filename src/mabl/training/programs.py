@@ -3,13 +3,15 @@
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial, wraps
 from typing import Any, NamedTuple
 
 import jax
+from jax.sharding import Mesh
 
 from mabl.algorithms import registry as algorithms
 from mabl.algorithms.config import Config
+from mabl.devices import SEEDS, by_seed, grid, traced_for
 from mabl.envs import registry as envs
 from mabl.envs.host import Hosted
 from mabl.nets.product import in_precision
@@ -27,6 +29,8 @@ class Programs(NamedTuple):
     training: Training
     init: Any
     """First states from keys `[S]`."""
+    place: Callable[[TrainState], TrainState]
+    """Puts states where they are computed."""
     open_cycle: Callable[[Config], AbstractContextManager[Cycle]]
     """Goes on from states, with the workers of the run's own config if there are any."""
     diagnose: Callable[[TrainState], Metrics]
@@ -68,19 +72,18 @@ def _programs(config: Config, *registered: Any) -> Programs:
 
     return Programs(
         training,
-        init=jax.jit(jax.vmap(training.init)),
-        open_cycle=_open_cycle(training, config.num_seeds),
-        diagnose=_over_seeds(in_precision(config.precision, diagnose), config.num_seeds),
+        init=_over_seeds(training.init, config),
+        place=partial(jax.device_put, device=by_seed(grid_of(config))),
+        open_cycle=_open_cycle(training, config),
+        diagnose=_over_seeds(diagnose, config),
     )
 
 
-def _open_cycle(training: Training, n_seeds: int) -> Callable[[Config], Any]:
-    precision = training.algorithm.config.precision
+def _open_cycle(training: Training, config: Config) -> Callable[[Config], Any]:
     if isinstance(training.env, Hosted):
-        learn = in_precision(precision, training.learn)
-        learn = _over_seeds(learn, n_seeds, n_states=3, donate=True)
-        return hosted_cycle(training, learn, n_seeds)
-    cycle = _over_seeds(in_precision(precision, training.cycle), n_seeds, donate=True)
+        learn = _over_seeds(training.learn, config, n_states=3, donate=True)
+        return hosted_cycle(training, learn, config.num_seeds)
+    cycle = _over_seeds(training.cycle, config, donate=True)
     return lambda config: nullcontext(cycle)
 
 
@@ -88,7 +91,12 @@ forget_programs = _programs.cache_clear
 """Lets go of them."""
 
 
-def _over_seeds(function: Any, n_seeds: int, n_states: int = 1, donate: bool = False) -> Any:
+def grid_of(config: Config) -> Mesh:
+    """The devices of a run."""
+    return grid(config.num_devices, config.num_seeds)
+
+
+def _over_seeds(function: Any, config: Config, n_states: int = 1, donate: bool = False) -> Any:
     """Compile a function of one seed's state for all seeds; a single seed is spared the vmap.
 
     All but the first `n_states` arguments are trip counts. They stay scalars, so that loops are not
@@ -97,10 +105,25 @@ def _over_seeds(function: Any, n_seeds: int, n_states: int = 1, donate: bool = F
 
     def mapped(*arguments: Any) -> Any:
         states, counts = arguments[:n_states], arguments[n_states:]
-        if n_seeds > 1:
+        if config.num_seeds > 1:
             axes = (*[0] * n_states, *[None] * len(counts))
-            return jax.vmap(function, in_axes=axes)(*arguments)
+            return jax.vmap(function, in_axes=axes, spmd_axis_name=SEEDS)(*arguments)
         one = jax.tree.map(lambda x: x[0], states)
         return jax.tree.map(lambda x: x[None], function(*one, *counts))
 
-    return jax.jit(mapped, donate_argnums=0 if donate else ())
+    return jax.jit(
+        as_in_a_run(mapped, config),
+        donate_argnums=0 if donate else (),
+        out_shardings=by_seed(grid_of(config)),
+    )
+
+
+def as_in_a_run(function: Callable[..., Any], config: Config) -> Callable[..., Any]:
+    """The function, traced in the precision and for the devices of a run."""
+
+    @wraps(function)
+    def traced(*arguments: Any) -> Any:
+        with traced_for(grid_of(config)):
+            return function(*arguments)
+
+    return in_precision(config.precision, traced)

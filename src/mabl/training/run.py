@@ -15,6 +15,7 @@ from rich.console import Console
 
 from mabl.algorithms.config import Config
 from mabl.algorithms.diagnostics import DIAGNOSED_ROWS
+from mabl.devices import SEEDS
 from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
 from mabl.runs import folder
@@ -23,7 +24,7 @@ from mabl.runs.metrics import MetricsLog, Row, read
 from mabl.training import curves
 from mabl.training.loop import Training, TrainState
 from mabl.training.memory import check_memory, free_memory, tree_bytes
-from mabl.training.programs import programs
+from mabl.training.programs import grid_of, programs
 from mabl.training.progress import Progress, duration
 
 CURVES_EVERY = 30.0
@@ -86,7 +87,7 @@ def check_memory_of(config: Config, console: Console) -> TrainState:
         f"optimisers {learner / 2**20:,.0f} MiB",
         highlight=False,
     )
-    check_memory(replay, free_memory())
+    check_memory(replay // grid_of(config).shape[SEEDS], free_memory())
     return shape
 
 
@@ -100,6 +101,7 @@ def _run(
     """Cycle until every seed is done. `states` has a leading axis of seeds."""
     run = programs(config)
     training, total_steps = run.training, config.total_steps
+    states = run.place(states)
     keep = config.training.keep_checkpoints
     checkpoints = [Checkpoints(path / "checkpoints", keep, create=True) for path in folders]
     step = int(states.env_steps.min())

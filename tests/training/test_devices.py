@@ -1,0 +1,43 @@
+"""Several devices compute the numbers of one: eight virtual ones, in processes of their own."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+EIGHT = "--xla_force_host_platform_device_count=8"
+
+
+def trained(path, algo, n_seeds, n_devices):
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {EIGHT}"
+    arguments = (algo, n_seeds, n_devices, path)
+    subprocess.run(
+        [sys.executable, "-m", "tests.training.on_devices", *map(str, arguments)],
+        env=os.environ | {"XLA_FLAGS": flags},
+        check=True,
+        timeout=300,
+    )
+    return dict(np.load(path))
+
+
+@pytest.mark.parametrize(
+    ("algo", "n_seeds", "n_devices"),
+    [("mabl", 1, 4), ("mabl", 8, 8), ("mabl-qmix", 2, 8), ("mappo", 2, 4)],
+)
+def test_devices_share_batches_and_seeds(tmp_path, algo, n_seeds, n_devices):
+    many = trained(tmp_path / "many.npz", algo, n_seeds, n_devices)
+    one = trained(tmp_path / "one.npz", algo, n_seeds, 1)
+    assert one.pop("devices") == 1 and many.pop("devices") == n_devices
+    assert one.pop("compiled") == many.pop("compiled") == 0  # states stay where they lay
+    assert set(one) == set(many) and len(one) > 30
+    for name in one:
+        assert_allclose(many[name], one[name], rtol=2e-3, atol=2e-4, err_msg=name)
+
+
+def test_more_devices_than_there_are_is_one_line(mabl, tmp_path):
+    code, _, err = mabl("train", "--num-devices=64", f"--logdir={tmp_path}")
+    assert code == 2 and "--num-devices is 64: give a number up to" in err
+    assert "Traceback" not in err and not any(tmp_path.iterdir())
