@@ -8,6 +8,7 @@ from tests.tiny import flags, tiny
 
 from mabl import bench
 from mabl.errors import UserError
+from mabl.nets.product import product
 
 
 def test_work_is_counted_by_hand():
@@ -22,6 +23,10 @@ def test_work_is_counted_by_hand():
     assert bench.flop(jax.make_jaxpr(looped)(x).jaxpr) == 840
     assert bench.flop(jax.make_jaxpr(jax.vmap(looped))(jnp.ones((2, 5, 3))).jaxpr) == 1680
     assert bench.flop(jax.make_jaxpr(lambda x: (x * x).sum())(x).jaxpr) == 0
+    # Of networks: 210, and both gradients as much again
+    assert bench.flop(jax.make_jaxpr(jax.grad(lambda w: product(x, w).sum()))(w).jaxpr) == 420
+    learned = jax.grad(lambda x, w: product(product(x, w), w.T).sum(), (0, 1))
+    assert bench.flop(jax.make_jaxpr(learned)(x, w).jaxpr) == 6 * 210
 
     def either(x):  # one product or two
         return jax.lax.cond(x[0, 0] > 0, lambda x: x @ w, lambda x: (x @ w) @ w.T @ w, x)
@@ -68,12 +73,14 @@ def test_bench_writes_what_it_compares_with(tmp_path, mabl):
     assert "jax" in written["machine"] and "git" in written["machine"]
 
     written["timings"]["model update"]["median"] = 1000.0  # seconds, so that ours is far faster
+    written["subject"]["precision"] = "bfloat16"
     path.write_text(json.dumps(written))
     code, out, _ = mabl(*arguments, "model update", "collection", f"--against={path}")
     (model,) = (line for line in out.splitlines() if line.strip().startswith("model update"))
     (collection,) = (line for line in out.splitlines() if line.strip().startswith("collection"))
     assert code == 0 and float(model.split()[-1].replace(",", "")) > 1000
     assert collection.split()[-1] == "-"  # it was not timed before
+    assert "against another: precision bfloat16 -> float32" in out
 
 
 def test_what_cannot_be_timed_is_said(tmp_path, mabl):

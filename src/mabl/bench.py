@@ -37,8 +37,10 @@ from mabl.training.programs import as_in_a_run, build, forget_programs, programs
 from mabl.training.run import longest_lane
 from mabl.types import PRNGKey
 
-PEAK_SIZE = 2048
-"""Rows and columns of the matrices whose product is the peak."""
+PEAK_SIZE = {"cpu": 2048}
+"""Rows and columns of the matrices whose product is the peak, by backend."""
+PEAK_SIZE_OF_OTHERS = 8192
+"""Which a smaller one would not fill."""
 COPIED = 2**28
 """Bytes that are copied to measure an accelerator's bandwidth."""
 LEARNING = ("replay sampling", "model update", "imagination", "behaviour update")
@@ -272,13 +274,13 @@ def without_cache() -> Iterator[None]:
 
 def peaks(repeats: int) -> dict[str, float]:
     """What the device does at best, measured here and now."""
-    found = {}
+    found, size = {}, PEAK_SIZE.get(jax.default_backend(), PEAK_SIZE_OF_OTHERS)
     for kind in (jnp.float32, jnp.bfloat16):
-        ones = jnp.ones((PEAK_SIZE, PEAK_SIZE), kind)
+        ones = jnp.ones((size, size), kind)
         product = jax.jit(partial(jnp.matmul, preferred_element_type=jnp.float32))
         clock(partial(product, ones, ones))
         fastest = min(clock(partial(product, ones, ones)) for _ in range(repeats))
-        found[jnp.dtype(kind).name] = 2 * PEAK_SIZE**3 / fastest
+        found[jnp.dtype(kind).name] = 2 * size**3 / fastest
     if jax.default_backend() != "cpu":
         block = jnp.zeros(COPIED // 4, jnp.float32)
         copy = jax.jit(lambda x: x + 1)
@@ -302,14 +304,17 @@ def read(path: Path) -> dict[str, Any]:
     """What `Report.write` wrote. Raises UserError for anything else."""
     try:
         found = json.loads(path.read_text())
-        return found | {"timings": {k: v["median"] for k, v in found["timings"].items()}}
+        timings = {k: v["median"] for k, v in found["timings"].items()}
+        return {"subject": found["subject"], "machine": found["machine"], "timings": timings}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is no report of mabl bench --json: {error}") from error
 
 
 def table(report: Report, baseline: dict[str, Any] | None = None) -> Table:
     """For people; with a baseline, how many times faster each part is than it was there."""
-    made = Table(box=None, title=title(report), caption=caption(report), title_justify="left")
+    made = Table(
+        box=None, title=title(report), caption=caption(report, baseline), title_justify="left"
+    )
     made.caption_justify = "left"
     headings = ["part", "median", "least", "greatest", "GFLOP", "GFLOP/s", "of peak", "temporary"]
     for heading in headings + ["times as fast"] * (baseline is not None):
@@ -318,7 +323,7 @@ def table(report: Report, baseline: dict[str, Any] | None = None) -> Table:
         rate = timing.flop / timing.median
         cells = [name, *(milliseconds(float(f(timing.seconds))) for f in (np.median, min, max))]
         cells += [f"{timing.flop / 1e9:,.1f}", f"{rate / 1e9:,.0f}"] if rate else ["", ""]
-        cells.append(f"{rate / report.peak['float32']:.0%}" if rate else "")
+        cells.append(f"{rate / report.peak[report.subject['precision']]:.0%}" if rate else "")
         cells.append(f"{timing.temporary / 2**20:,.0f} MiB" if timing.temporary else "")
         if baseline is not None:
             before = baseline["timings"].get(name)
@@ -338,16 +343,25 @@ def title(report: Report) -> str:
     )
 
 
-def caption(report: Report) -> str:
-    """What is measured once."""
+def caption(report: Report, baseline: dict[str, Any] | None = None) -> str:
+    """What is measured once, and how what was run differs from what it is compared with."""
     peak = ", ".join(
         f"{kind} {rate / 1e9:,.0f} G{'B' if kind == 'copy' else 'FLOP'}/s"
         for kind, rate in report.peak.items()
     )
-    return (
-        f"peak: {peak}\ncompiling, and a first collection: {report.compile_seconds:.1f} s; "
-        f"most memory: {report.memory / 2**20:,.0f} MiB"
-    )
+    lines = [
+        f"peak: {peak}",
+        f"compiling, and a first collection: {report.compile_seconds:.1f} s; "
+        f"most memory: {report.memory / 2**20:,.0f} MiB",
+    ]
+    if baseline is not None:
+        ours, theirs = (
+            {k: v for of in ("subject", "machine") for k, v in found[of].items()}
+            for found in (report._asdict(), baseline)
+        )
+        changed = [f"{k} {theirs.get(k)} -> {v}" for k, v in ours.items() if theirs.get(k) != v]
+        lines.append(f"against another: {', '.join(changed) or 'the same, run before'}")
+    return "\n".join(lines)
 
 
 def milliseconds(seconds: float) -> str:
