@@ -229,6 +229,12 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
     ("paper", "test", "mag"): _MAMBA_PAPER,
     ("paper", "smax", "mappo"): {"training": _RECIPE},
     ("paper", "test", "mappo"): {"training": _RECIPE},
+    # Half the work of the family's preset, and as many wins (docs/results/performance.md).
+    ("quick", "smax/3m", "mabl"): {
+        "precision": "bfloat16",
+        "training": {"model_updates": 10},
+        "world_model": {"learning_rate": 1.3e-3},
+    },
     ("quick", "smax", "mag"): {"lookahead": {"steps": 3, "hidden": 128, "n_hidden": 2}},
     ("quick", "smax", "mappo"): {
         "training": _ON_POLICY | {"num_envs": 16, "collect_steps": 64, "replay_capacity": 1_024},
@@ -265,7 +271,8 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
         },
     },
 }
-"""Fields that an algorithm changes, and fields of its sections, by (preset, family, algo)."""
+"""Fields that an algorithm changes, and fields of its sections, by (preset, family or environment,
+algo)."""
 
 
 KIN: dict[str, str] = dict.fromkeys(
@@ -286,8 +293,10 @@ def preset(name: str, env: str, algo: str) -> Config:
     if family not in families:
         raise registry.unknown(env)
     config = replace(families[family], env=env, algo=algo)
-    by_algorithm = BY_ALGORITHM.get((name, KIN.get(family, family), algo), {})
-    for changes in (BY_ENV.get((name, env), {}), by_algorithm):
+    by_family, by_both = (
+        BY_ALGORITHM.get((name, where, algo), {}) for where in (KIN.get(family, family), env)
+    )
+    for changes in (BY_ENV.get((name, env), {}), by_family, by_both):
         for field, new in changes.items():
             value = replace(getattr(config, field), **new) if isinstance(new, dict) else new
             config = replace(config, **{field: value})
