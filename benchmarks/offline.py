@@ -27,7 +27,7 @@ from mabl.execution import executor_of
 from mabl.replay import Replay
 from mabl.runs import folder
 from mabl.runs.checkpoint import Checkpoints
-from mabl.training.programs import build
+from mabl.training.programs import as_in_a_run, build
 from mabl.types import PRNGKey
 
 CHUNK = 50
@@ -90,16 +90,15 @@ def main() -> None:
         learner = learner._replace(model=state.learner.model)
 
     def fit(update: Callable) -> Callable:
-        @jax.jit
         def chunk(learner: Learner, rows: Replay, key: PRNGKey) -> Learner:
             keys = jax.random.split(key, CHUNK)
             experience = replayed(rows)
             return jax.lax.scan(lambda carry, key: update(carry, experience, key), learner, keys)[0]
 
-        return chunk
+        return jax.jit(as_in_a_run(chunk, algorithm.config))
 
     fit_model, fit_policy = fit(algorithm.update_model), fit(algorithm.update_policy)
-    diagnose = jax.jit(algorithm.diagnose)
+    diagnose = jax.jit(as_in_a_run(algorithm.diagnose, algorithm.config))
 
     def report(n: int) -> None:
         for name, replay in (("trained", trained), ("held_out", held_out)):

@@ -30,7 +30,7 @@ from mabl.replay import Replay
 from mabl.rows import TimeStep
 from mabl.training.programs import as_in_a_run
 
-AGENTS, SEEDS = (2, 4, 8, 16, 32), (1, 2, 5, 10)
+NUMBERS_OF_AGENTS, NUMBERS_OF_SEEDS = (2, 4, 8, 16, 32), (1, 2, 5, 10)
 OBS, STATE, ACTIONS, ROWS = 88, 84, 9, 400
 
 
@@ -133,7 +133,7 @@ def draw(rows: list[dict], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--preset", default="quick")
-    parser.add_argument("--precision", default="bfloat16")
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="bfloat16")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--draw", type=Path, help="draw what is in --out, measure nothing")
@@ -141,7 +141,9 @@ def main() -> None:
     if args.draw:
         draw([json.loads(line) for line in args.out.read_text().splitlines()], args.draw)
         return
-    sizes = [("agents", n, 1) for n in AGENTS] + [("seeds", 3, n) for n in SEEDS]
+    sizes = [("agents", n, 1) for n in NUMBERS_OF_AGENTS] + [
+        ("seeds", 3, n) for n in NUMBERS_OF_SEEDS
+    ]
     with args.out.open("w") as file:
         for sweep, n_agents, n_seeds in sizes:
             for row in point(args.preset, args.precision, n_agents, n_seeds, args.repeats):

@@ -154,9 +154,8 @@ def measure(
             )
             timings["cycle"] = timing._replace(flop=work)
     say("peak")
-    subject = {
-        name: getattr(config, name) for name in ("preset", "env", "algo", "precision", "num_seeds")
-    }
+    about = ("preset", "env", "algo", "precision", "num_seeds", "num_devices")
+    subject = {name: getattr(config, name) for name in about}
     return Report(
         subject | {"n_agents": training.env.spec.n_agents},
         folder.versions() | {"device": jax.devices()[0].device_kind, "cores": n_cores()},
@@ -248,10 +247,13 @@ def flop(jaxpr: Any) -> float:
     total = 0.0
     for equation in jaxpr.eqns:
         name = equation.primitive.name
-        if name in ("dot_general", "product"):
+        summed: tuple[int, ...] = ()
+        if name == "dot_general":
+            summed = equation.params["dimension_numbers"][0][0]
+        elif name == "product":  # of nets.product
+            summed = (-1,)
+        if summed:
             shape = equation.invars[0].aval.shape
-            last = (len(shape) - 1,)
-            summed = equation.params["dimension_numbers"][0][0] if name == "dot_general" else last
             total += 2 * prod(equation.outvars[0].aval.shape) * prod(shape[i] for i in summed)
         each = [flop(inner) for inner in jaxprs_in_params(equation.params)]
         inner = max(each) if name == "cond" else sum(each)
@@ -305,7 +307,11 @@ def read(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text())
         timings = {k: v["median"] for k, v in found["timings"].items()}
-        return {"subject": found["subject"], "machine": found["machine"], "timings": timings}
+        return {
+            "subject": {**found["subject"]},
+            "machine": {**found["machine"]},
+            "timings": timings,
+        }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is no report of mabl bench --json: {error}") from error
 
@@ -336,10 +342,11 @@ def title(report: Report) -> str:
     """What was run, and where."""
     subject, on = report.subject, report.machine
     seeds = "" if subject["num_seeds"] == 1 else f", {subject['num_seeds']} seeds"
+    devices = "" if subject["num_devices"] == 1 else f" on {subject['num_devices']} devices"
     return (
         f"{subject['algo']} on {subject['env']} ({subject['n_agents']} agents{seeds}), preset "
-        f"{subject['preset']}, {subject['precision']}; {on['device']}, {on['cores']} cores, "
-        f"jax {on['jax']}"
+        f"{subject['preset']}, {subject['precision']}{devices}; {on['device']}, {on['cores']} "
+        f"cores, jax {on['jax']}"
     )
 
 

@@ -119,6 +119,8 @@ class ResumeArguments:
     """Run folder, as printed by `mabl train`."""
     total_steps: int | None = None
     """New number of environment steps; default: as configured."""
+    num_devices: int | None = None
+    """Accelerators to go on with; default: as configured."""
 
 
 def resume(arguments: list[str]) -> int:
@@ -127,7 +129,11 @@ def resume(arguments: list[str]) -> int:
     from mabl.training.run import resume as resume_run
 
     use_compilation_cache()
-    return INTERRUPTED if resume_run(given.run, given.total_steps).interrupted else 0
+    return (
+        INTERRUPTED
+        if resume_run(given.run, given.total_steps, given.num_devices).interrupted
+        else 0
+    )
 
 
 @dataclass(frozen=True)

@@ -149,6 +149,30 @@ def test_second_derivatives():
     assert_allclose(hessian(product), hessian(jnp.matmul), rtol=1e-5, atol=1e-4)
 
 
+def test_on_a_cpu_no_product_in_bfloat16_has_a_transposed_operand():
+    """Which would take XLA's slow kernel."""
+    x, w = jnp.ones((64, 32)), jnp.ones((32, 48))
+
+    def products(precision):
+        def loss(x, w):
+            return jnp.sin(jax.vmap(product, (0, None))(x, w)).sum()
+
+        gradients = jax.jit(in_precision(precision, jax.grad(loss, (0, 1))))
+        text = gradients.lower(x, w).compile().as_text()
+        plain = "lhs_contracting_dims={1}, rhs_contracting_dims={0}"
+        return [plain in line for line in text.splitlines() if " dot(" in line]
+
+    assert products("bfloat16") == [True] * 3
+    assert not all(products("float32"))
+
+
+def test_gradients_have_the_type_of_what_they_are_of():
+    x, w = jnp.ones((4, 3), jnp.bfloat16), jnp.ones((3, 2))
+    to_x, to_w = jax.grad(lambda x, w: product(x, w).sum(), (0, 1))(x, w)
+    assert to_x.dtype == jnp.bfloat16 and to_w.dtype == jnp.float32
+
+
 def test_of_matrices_times_nothing():
     assert product(jnp.ones((0, 3)), jnp.ones((3, 2))).shape == (0, 2)
+    assert (product(jnp.ones((3, 0)), jnp.ones((0, 2))) == jnp.zeros((3, 2))).all()
     assert (product(jnp.ones(3), jnp.ones((3, 2))) == 3).all()

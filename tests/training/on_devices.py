@@ -1,20 +1,24 @@
 """What `test_devices.py` runs in a process of its own, which has eight devices.
 
-python -m tests.training.on_devices ALGO NUM_SEEDS NUM_DEVICES FILE
+    python -m tests.training.on_devices ALGO NUM_SEEDS NUM_DEVICES FOLDER
+
+`numbers.npz` is written to the folder, and a checkpoint of the first seed.
 """
 
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
 from tests.tiny import tiny
 
-from mabl.runs.checkpoint import named
+from mabl.runs.checkpoint import Checkpoints, named
 from mabl.training.programs import programs
+from mabl.training.run import save
 
 
-def main(algo, n_seeds, n_devices, path):
+def main(algo, n_seeds, n_devices, folder):
     jax.config.update("jax_disable_most_optimizations", True)
     config = replace(tiny(algo), num_seeds=n_seeds, num_devices=n_devices)
     run = programs(config)
@@ -34,8 +38,13 @@ def main(algo, n_seeds, n_devices, path):
     found = dict(metrics) | run.diagnose(states) | dict(named(states.learner))
     lies_on = {d.id for leaf in jax.tree.leaves(states) for d in leaf.sharding.device_set}
     about = {"devices": len(lies_on), "compiled": len(compiled)}
-    np.savez(path, **{k.replace("/", "|"): np.asarray(v) for k, v in found.items()}, **about)
+    save(run.training, states, [Checkpoints(folder / "checkpoints", 1, create=True)])
+    np.savez(
+        folder / "numbers.npz",
+        **{k.replace("/", "|"): np.asarray(v) for k, v in found.items()},
+        **about,
+    )
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4]))

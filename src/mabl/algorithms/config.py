@@ -105,7 +105,7 @@ class Config:
     worker_timeout: float = 60.0
     """Seconds that they may take for a step or a reset before they are replaced."""
     precision: Precision = "float32"
-    """Of the operands of matrix products; sums, losses and parameters are float32."""
+    """Of the operands of layers' matrix products; sums, losses and parameters are float32."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
     communication: CommunicationConfig = field(default_factory=CommunicationConfig)

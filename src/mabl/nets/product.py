@@ -9,6 +9,7 @@ knows of at once.
 
 from collections.abc import Callable
 from functools import wraps
+from math import prod
 from typing import Any, Literal, TypeVar
 
 import jax
@@ -20,7 +21,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
 Precision = Literal["float32", "bfloat16"]
-"""Of a product's operands."""
+"""Of a product's operands. GPUs take TF32 for float32 where they have it, as is JAX's default."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -32,7 +33,7 @@ def in_precision(precision: Precision, function: F) -> F:
 
     @wraps(function)
     def traced(*arguments: Any) -> Any:
-        with jax.default_matmul_precision(precision):
+        with jax.default_matmul_precision("default" if precision == "float32" else precision):
             return function(*arguments)
 
     return traced  # pyright: ignore[reportReturnType]
@@ -40,16 +41,21 @@ def in_precision(precision: Precision, function: F) -> F:
 
 def product(x: Float[Array, "*b I"], weight: Float[Array, "I O"]) -> Float[Array, "*b O"]:
     """x W."""
-    rows = x.reshape(-1, x.shape[-1])
-    made = _product.bind(rows, weight, bfloat16=_asked_for_bfloat16())
-    return made.reshape(*x.shape[:-1], weight.shape[-1])
+    # JAX casts gradients back to what was given.
+    return _of_all(x.astype(jnp.float32), weight.astype(jnp.float32), _asked_for_bfloat16())
 
 
 def product_with_transposed(
     x: Float[Array, "*b O"], weight: Float[Array, "I O"]
 ) -> Float[Array, "*b I"]:
     """x W^T."""
-    return product(x, transposed(weight, _asked_for_bfloat16()))
+    bfloat16 = _asked_for_bfloat16()
+    return _of_all(x, transposed(weight, bfloat16), bfloat16)
+
+
+def _of_all(x: Array, weight: Array, bfloat16: bool) -> Array:
+    rows = x.reshape(prod(x.shape[:-1]), x.shape[-1])
+    return _product.bind(rows, weight, bfloat16=bfloat16).reshape(*x.shape[:-1], weight.shape[-1])
 
 
 def _asked_for_bfloat16() -> bool:
@@ -75,7 +81,13 @@ _product = Primitive("product")
 @_product.def_impl
 def _multiply(x: Array, weight: Array, *, bfloat16: bool) -> Array:
     kind = jnp.bfloat16 if bfloat16 else jnp.float32
-    return jnp.matmul(x.astype(kind), weight.astype(kind), preferred_element_type=jnp.float32)
+    # Lowered apart from what surrounds it: nothing may depend on JAX's setting any more.
+    return jnp.matmul(
+        x.astype(kind),
+        weight.astype(kind),
+        precision=jax.lax.Precision.DEFAULT,
+        preferred_element_type=jnp.float32,
+    )
 
 
 def _shape(x: Any, weight: Any, *, bfloat16: bool) -> Any:

@@ -56,7 +56,11 @@ class Checkpoints:
 
     def restore(self, item: str, like: T) -> T:
         """An item of the newest checkpoint, in the structure of `like` (arrays or their shapes)."""
-        wanted = jax.eval_shape(to_arrays, like)
+        here = jax.sharding.SingleDeviceSharding(jax.devices()[0])  # wherever they lay
+        wanted = {
+            name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here)
+            for name, x in jax.eval_shape(to_arrays, like).items()
+        }
         args = ocp.args.Composite(**{item: ocp.args.StandardRestore(wanted)})
         try:
             arrays = self._manager.restore(self.latest, args=args)[item]

@@ -14,6 +14,7 @@ import platform
 import subprocess
 from dataclasses import replace
 from datetime import datetime
+from math import gcd
 from pathlib import Path
 
 import yaml
@@ -30,7 +31,8 @@ def create(config: Config, seed: int) -> Path:
 
     Raises UserError where it cannot be written.
     """
-    config = replace(config, seed=seed, num_seeds=1)
+    devices = config.num_devices // gcd(config.num_devices, config.num_seeds)  # of one seed
+    config = replace(config, seed=seed, num_seeds=1, num_devices=devices)
     parent = Path(config.logdir) / config.env / config.algo / f"seed_{seed}"
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:

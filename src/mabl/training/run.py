@@ -52,14 +52,17 @@ def train(config: Config, console: Console | None = None) -> Outcome:
 
 
 def resume(
-    path: Path | str, total_steps: int | None = None, console: Console | None = None
+    path: Path | str,
+    total_steps: int | None = None,
+    num_devices: int | None = None,
+    console: Console | None = None,
 ) -> Outcome:
-    """Continue one run from its newest checkpoint, to `total_steps` or as configured."""
+    """Continue one run from its newest checkpoint, as configured or as told."""
     console = console or Console(stderr=True)
     path = Path(path)
     config = folder.read_config(path)
-    if total_steps is not None:
-        config = replace(config, total_steps=total_steps)
+    told = {"total_steps": total_steps, "num_devices": num_devices}
+    config = replace(config, **{name: new for name, new in told.items() if new is not None})
     checkpoints = Checkpoints(path / "checkpoints", config.training.keep_checkpoints)
     if checkpoints.latest >= config.total_steps:
         raise UserError(
@@ -87,7 +90,9 @@ def check_memory_of(config: Config, console: Console) -> TrainState:
         f"optimisers {learner / 2**20:,.0f} MiB",
         highlight=False,
     )
-    check_memory(replay // grid_of(config).shape[SEEDS], free_memory())
+    # Each device holds the replay of its seeds; virtual ones of a CPU share its memory.
+    devices = config.num_devices if jax.default_backend() == "cpu" else 1
+    check_memory(devices * replay // grid_of(config).shape[SEEDS], free_memory())
     return shape
 
 
