@@ -31,7 +31,7 @@ def trained(folder, algo, n_seeds, n_devices):
 
 @pytest.mark.parametrize(
     ("algo", "n_seeds", "n_devices"),
-    [("mabl", 1, 4), ("mabl", 8, 8), ("mabl-qmix", 2, 6), ("mappo", 2, 4)],
+    [("mabl", 2, 8), ("mabl-qmix", 1, 3)],  # 3 do not divide the batch
 )
 def test_devices_share_batches_and_seeds(tmp_path, algo, n_seeds, n_devices):
     many = trained(tmp_path / "many", algo, n_seeds, n_devices)
