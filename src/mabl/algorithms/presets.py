@@ -208,8 +208,8 @@ _MAMBA_PAPER = {
     "world_model": {"learning_rate": 2e-4},
     "mappo": {"actor_learning_rate": 5e-4, "critic_learning_rate": 5e-4},
 }
-# Talking is slower to learn than listening to oneself. With less entropy two of three agents may agree
-# early, and the third never.
+# Talking is slower to learn than listening to oneself. With less entropy two of three agents may
+# agree early, and the third never.
 _MAMBA_TEST = {
     "total_steps": 12_000,
     "training": {"model_updates": 20},
