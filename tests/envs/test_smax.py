@@ -1,5 +1,7 @@
 """The SMAX adapter against bare jaxmarl, its endings, and the ground that SMAX lacks."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import jax
@@ -38,6 +40,21 @@ def random_action(key, available):
 
 def rigged(env_state, **fields):
     return env_state._replace(game=replace(env_state.game, **fields))
+
+
+def test_jaxmarl_beside_smax_is_left_to_those_who_ask_for_it():
+    program = """
+import sys
+from mabl.envs import registry
+registry.make("smax/3m")
+assert not any("storm" in name for name in sys.modules)
+import jaxmarl
+env = jaxmarl.make("HeuristicEnemySMAX")
+from mabl.envs.smax import SMAX
+assert isinstance(env, jaxmarl.environments.MultiAgentEnv)
+assert jaxmarl.environments.SMAX is SMAX
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_every_row_equals_bare_jaxmarl(marines):

@@ -3,12 +3,12 @@
 Families are imported when asked for, as some are slow.
 """
 
-import io
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager
 from functools import partial
+from importlib.util import find_spec, module_from_spec
 from multiprocessing import current_process
 from typing import Any, NamedTuple
 
@@ -41,25 +41,27 @@ class EnvRow(NamedTuple):
 
 
 @contextmanager
-def _quiet_jaxmarl() -> Iterator[None]:
-    """Imports jaxmarl without its greeting on stdout, and without its brax environments.
+def _hollow(*packages: str) -> Iterator[None]:
+    """Imports modules of `packages` (outermost first) without what the packages themselves import.
 
-    Their module replaces `sys.stdout` and `sys.stderr` by the process's own, to the dismay of
-    whoever had redirected them. jaxmarl copes with its absence.
+    A later import of a package runs it in full, and finds the modules that are already there.
     """
-    if "jaxmarl" in sys.modules:
-        yield
-        return
-    sys.modules["jaxmarl.environments.mabrax"] = None  # type: ignore[assignment]
+    hollow = []
     try:
-        with redirect_stdout(io.StringIO()):
-            yield
+        for name in packages:
+            if name not in sys.modules and (spec := find_spec(name)):
+                sys.modules[name] = module_from_spec(spec)
+                hollow.append(name)
+        yield
     finally:
-        del sys.modules["jaxmarl.environments.mabrax"]
+        for name in hollow:
+            del sys.modules[name]
 
 
 def _smax() -> Mapping[str, Entry]:
-    with _quiet_jaxmarl():
+    # jaxmarl imports all of its environments (four seconds), prints, and with brax installed
+    # replaces `sys.stdout` and `sys.stderr`.
+    with _hollow("jaxmarl", "jaxmarl.environments"):
         from mabl.envs import smax
     return {
         f"smax/{name}": Entry(partial(smax.make, name), battle.description)

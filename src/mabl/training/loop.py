@@ -171,6 +171,7 @@ def repeat(
     n: Int[Array, ""],
 ) -> tuple[Any, Metrics]:
     """Apply `update` n times; a traced n lets prefill, pretraining and cycles share a program."""
+    update = jax.jit(update, inline=True)  # is traced once
     shapes = jax.eval_shape(update, carry, key)[1]
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
