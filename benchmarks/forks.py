@@ -87,7 +87,7 @@ def main() -> None:
     run = Path(sys.argv[1])
     training = build(folder.read_config(run))
     shape = jax.eval_shape(training.init, jax.random.key(0))
-    state = Checkpoints(run / "checkpoints").restore("state", shape)
+    _, state = Checkpoints(run / "checkpoints").restore("state", shape)
     model, newest = state.learner.model, int(state.replay.size.min())
     env = Flatland(training.env.spec.name)
     maps = [played(env, FIRST + i) for i in range(MAPS)]

@@ -78,7 +78,7 @@ def main() -> None:
     if not isinstance(training.algorithm, ModelBased):
         parser.error(f"{config.algo} is not just a world model and a behaviour in its imagination")
     shape = jax.eval_shape(training.init, jax.random.key(0))
-    state = Checkpoints(args.run / "checkpoints").restore("state", shape)
+    _, state = Checkpoints(args.run / "checkpoints").restore("state", shape)
     trained = environments(state.replay, slice(HELD_OUT, None))
     held_out = environments(state.replay, slice(HELD_OUT))
 

@@ -56,6 +56,11 @@ def _forget_programs():
     jax.clear_caches()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_settings_of_the_user(tmp_path_factory):
+    os.environ["XDG_CONFIG_HOME"] = str(tmp_path_factory.mktemp("settings"))
+
+
 @pytest.fixture
 def mabl(monkeypatch, capsys):
     """Runs a command in this process; returns exit code, stdout, stderr."""

@@ -18,6 +18,7 @@ from PIL import Image
 from mabl import Policy, TeamPolicy, UserError, cli
 from mabl.envs.coordination import CoordinationEnv
 from mabl.runs import folder as run_folder
+from mabl.runs.checkpoint import Checkpoints
 
 COORDINATION = ["--env=test/coordination"]
 TINY = [
@@ -209,11 +210,11 @@ def test_a_run_folder_that_cannot_be_written_is_one_line(trained, mabl, monkeypa
 
 
 def test_a_run_that_diverges_stops_before_it_spoils_its_checkpoints(mabl, tmp_path):
-    rate = "--mappo.critic-learning-rate=1e38"
-    code, _, err = mabl("train", *TINY, "--total-steps=600", rate, f"--logdir={tmp_path}")
-    assert code == 2 and "training diverged before step" in err
-    assert "(behaviour.critic." in err and "none was kept: lower the learning rates" in err
-    assert not any(path.name.isdigit() for path in tmp_path.rglob("checkpoints/*"))
+    given = ["--mappo.critic-learning-rate=1e38", "--training.max-skipped-updates=2"]
+    code, _, err = mabl("train", *TINY, "--total-steps=900", *given, f"--logdir={tmp_path}")
+    assert code == 2 and "2 gradients in a row were not finite for behaviour.critic_opt" in err
+    assert "no checkpoint was written: lower the learning rates" in err
+    assert not list(tmp_path.rglob("checkpoints/*"))
 
 
 def test_a_replay_that_cannot_fit_is_refused_before_it_is_allocated(mabl, tmp_path):
@@ -247,6 +248,7 @@ def test_the_commit_is_mabls_not_that_of_a_repository_it_is_installed_in(monkeyp
 def test_a_run_folder_holds_what_the_documentation_says(trained):
     present = {path.name for path in trained.iterdir()}
     assert present == {
+        ".lock",
         "config.yaml",
         "versions.yaml",
         "metrics.jsonl",
@@ -265,22 +267,25 @@ def test_a_run_folder_holds_what_the_documentation_says(trained):
     assert any("world_model/open_loop_obs_15" in row for row in rows_of(trained))
 
 
-def test_ctrl_c_saves_and_the_run_can_be_resumed(mabl, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "expected"), [(signal.SIGINT, cli.INTERRUPTED), (signal.SIGTERM, cli.PREEMPTED)]
+)
+def test_a_signal_saves_and_the_run_can_be_resumed(mabl, tmp_path, number, expected):
     logdir = tmp_path / "runs"
 
     def interrupt():
         pattern = "test/coordination/mabl/seed_0/*/metrics.jsonl"
         while not any(path.stat().st_size for path in logdir.glob(pattern)):
             time.sleep(0.05)
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
 
     thread = threading.Thread(target=interrupt)
     thread.start()
     code, _, err = mabl("train", *TINY, "--total-steps=10000000", f"--logdir={logdir}")
     thread.join()
-    assert code == cli.INTERRUPTED and "interrupted at" in err and "mabl resume" in err
+    assert code == expected and "interrupted at" in err and "mabl resume" in err
     (folder,) = logdir.glob("test/coordination/mabl/seed_0/*")
-    (done,) = (int(path.name) for path in (folder / "checkpoints").iterdir())
+    (done,) = Checkpoints(folder / "checkpoints").steps
     assert rows_of(folder)[-1]["step"] == done
     assert mabl("resume", folder, f"--total-steps={done + 100}")[0] == 0
     assert rows_of(folder)[-1]["step"] >= done + 100

@@ -1,10 +1,11 @@
 """The command line: train, resume, eval, play, envs, check-env, bench, algos."""
 
-import errno
 import json
 import os
+import signal
 import sys
-from argparse import ArgumentParser
+import warnings
+from argparse import ArgumentError, ArgumentParser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, make_dataclass
@@ -16,7 +17,8 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from mabl.errors import UserError, unknown_name
+from mabl.errors import UNWRITABLE, UserError, unknown_name
+from mabl.parsing import parse
 
 if TYPE_CHECKING:
     from mabl.algorithms.config import Config
@@ -26,15 +28,19 @@ T = TypeVar("T")
 PIPED_WIDTH = 160
 """Columns of a table that goes to a file or another program."""
 
-UNWRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC)
-"""A user's to mend: no permission, a file system for reading only, a full disk."""
-
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""
+
+PREEMPTED = 75
+"""Exit code after SIGTERM, all being saved: `EX_TEMPFAIL`, go on with `mabl resume`."""
+
+EXIT_CODES = {None: 0, signal.SIGINT: INTERRUPTED, signal.SIGTERM: PREEMPTED}
+"""Of a run, by what ended it early."""
 
 
 def main() -> None:
     """Run a command. A user's mistake is one line on stderr and exit code 2."""
+    warnings.formatwarning = lambda message, *_, **__: f"mabl: {message}\n"
     try:
         sys.exit(run(sys.argv[1:]))
     except UserError as error:
@@ -45,10 +51,13 @@ def main() -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
-        if error.errno not in UNWRITABLE:
+        if error.filename is None and error.errno not in UNWRITABLE:
             raise
         where = f" ({error.filename})" if error.filename else ""
-        print(f"mabl: {error.strerror}{where}: give mabl a place to write", file=sys.stderr)
+        what = (
+            "give mabl a place to write" if error.errno in UNWRITABLE else "look at what is there"
+        )
+        print(f"mabl: {error.strerror}{where}: {what}", file=sys.stderr)
         sys.exit(2)
 
 
@@ -70,17 +79,20 @@ def train(arguments: list[str]) -> int:
     from mabl.training.run import train as train_run
 
     use_compilation_cache()
-    return INTERRUPTED if train_run(config).interrupted else 0
+    return EXIT_CODES[train_run(config).stopped_by]
 
 
 def chosen_preset(arguments: list[str]) -> tuple["Config", list[str]]:
     """The preset of an environment and an algorithm, and the flags that are left."""
     from mabl.algorithms.presets import preset
 
-    base = ArgumentParser(add_help=False, allow_abbrev=False)
+    base = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for flag, default in (("--env", "smax/3m"), ("--algo", "mabl"), ("--preset", "quick")):
         base.add_argument(flag, default=default)
-    chosen, rest = base.parse_known_args(arguments)
+    try:
+        chosen, rest = base.parse_known_args(arguments)
+    except ArgumentError as error:
+        raise UserError(f"{error}: mabl train --help lists them") from error
     return preset(chosen.preset, chosen.env, chosen.algo), rest
 
 
@@ -101,13 +113,8 @@ def parse_with_config(
         for section in unread(default.algo)
     ]
     flags = make_dataclass("Config", [*own, *hidden], bases=(Config,), frozen=True)
-    given = tyro.cli(
-        flags,
-        args=arguments,
-        default=flags(**shallow(default)),
-        prog=prog,
-        description=description,
-    )
+    base = flags(**shallow(default))
+    given = parse(flags, arguments, prog, default=base, description=description)
     return Config(**{name: getattr(given, name) for name in shallow(default)}), given
 
 
@@ -121,19 +128,17 @@ class ResumeArguments:
     """New number of environment steps; default: as configured."""
     num_devices: int | None = None
     """Accelerators to go on with; default: as configured."""
+    trust: bool = False
+    """Let a run that somebody else wrote name its environment's code."""
 
 
 def resume(arguments: list[str]) -> int:
     """Continue a run from its newest checkpoint."""
-    given = tyro.cli(ResumeArguments, args=arguments, prog="mabl resume")
+    given = parse(ResumeArguments, arguments, "mabl resume")
     from mabl.training.run import resume as resume_run
 
     use_compilation_cache()
-    return (
-        INTERRUPTED
-        if resume_run(given.run, given.total_steps, given.num_devices).interrupted
-        else 0
-    )
+    return EXIT_CODES[resume_run(**shallow(given)).stopped_by]
 
 
 @dataclass(frozen=True)
@@ -152,6 +157,8 @@ class PlayerArguments:
     """Take the likeliest action; --no-greedy or --sample draws it from the policy."""
     seed: int = 0
     """Decides the episodes."""
+    trust: bool = False
+    """Let a run that somebody else wrote name its environment's code."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +186,7 @@ class PlayArguments(PlayerArguments):
 def parse_player(arguments: type[T], given: list[str], prog: str) -> T:
     """Arguments of those that play episodes. Raises UserError for what cannot be meant."""
     given = ["--no-greedy" if a == "--sample" else a for a in given]
-    parsed: Any = tyro.cli(arguments, args=given, prog=prog)
+    parsed: Any = parse(arguments, given, prog)
     if (parsed.run is None) == (parsed.policy is None):
         raise UserError("give either a run folder or --policy random|heuristic with --env")
     if parsed.policy is not None and parsed.env is None:
@@ -196,7 +203,7 @@ def player(given: PlayerArguments) -> tuple[Any, Any, dict[str, Any]]:
     if given.run is not None:
         from mabl.policy import load_run
 
-        loaded = load_run(given.run, given.env, given.env_kwargs, given.greedy)
+        loaded = load_run(given.run, given.env, given.env_kwargs, given.greedy, given.trust)
         subject = {"run": str(given.run), "step": loaded.step, "greedy": given.greedy}
         return loaded.env, loaded.executor, subject
     from mabl.envs import registry
@@ -278,7 +285,7 @@ class CheckArguments:
 
 def check_env(arguments: list[str]) -> int:
     """Check an environment with a random policy."""
-    given = tyro.cli(CheckArguments, args=arguments, prog="mabl check-env")
+    given = parse(CheckArguments, arguments, "mabl check-env")
     if given.episodes < 1:
         raise UserError(f"--episodes is {given.episodes}: give a number above 0")
     from mabl.checking import check
@@ -325,7 +332,7 @@ def bench(arguments: list[str]) -> int:
 
 def list_envs(arguments: list[str]) -> None:
     """List environments."""
-    tyro.cli(lambda: None, args=arguments, prog="mabl envs", description=list_envs.__doc__)
+    parse(lambda: None, arguments, "mabl envs", description=list_envs.__doc__)
     from mabl.envs import registry
 
     rows = registry.names()
@@ -339,7 +346,7 @@ def list_envs(arguments: list[str]) -> None:
 
 def list_algos(arguments: list[str]) -> None:
     """List algorithms."""
-    tyro.cli(lambda: None, args=arguments, prog="mabl algos", description=list_algos.__doc__)
+    parse(lambda: None, arguments, "mabl algos", description=list_algos.__doc__)
     from mabl.algorithms.registry import ALGORITHMS, COLUMNS
 
     table = Table(box=None, padding=(0, 1))

@@ -1,8 +1,19 @@
 """The one exception whose text is shown to a user instead of a traceback."""
 
+import errno
 from collections.abc import Iterable
 from difflib import get_close_matches
 from math import inf
+
+UNWRITABLE = (
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+)
+"""A user's to mend: no permission, a file system for reading only, a full disk, a limit reached."""
 
 
 class UserError(Exception):
@@ -11,7 +22,7 @@ class UserError(Exception):
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The error for a name that a registry lacks, with the nearest names and all that exist."""
-    names = sorted(known)
+    names, name = sorted(known), name[:100]
     task = name.rpartition("/")[2]
     near = get_close_matches(name, names, n=3, cutoff=0.5) or [
         other for other in names if other.endswith(f"/{task}")

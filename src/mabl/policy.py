@@ -36,22 +36,24 @@ def load_run(
     env: str | None = None,
     env_kwargs: Sequence[str] = (),
     greedy: bool = True,
+    trust: bool = False,
 ) -> LoadedRun:
     """The newest checkpoint's policy, in its own environment or in `env`.
 
+    With `trust`, the run may name code of this machine as its environment, whoever wrote it.
     Raises UserError if the folder is not a run or if the policy does not fit the environment.
     """
     path = Path(path)
-    config = folder.read_config(path)
+    config = folder.read_config(path, trust)
     checkpoints = Checkpoints(path / "checkpoints")
     trained_in = envs.make(config.env, config.env_kwargs)
     played_in = envs.make(env or config.env, env_kwargs) if env or env_kwargs else trained_in
     check_fits(trained_in.spec, played_in.spec)
     algorithm = algorithms.make(config, trained_in.spec)
     shape = jax.eval_shape(lambda key: algorithm.policy(algorithm.init(key)), jax.random.key(0))
-    policy = checkpoints.restore("policy", shape)
+    step, policy = checkpoints.restore("policy", shape)
     executor = executor_of(policy, trained_in.spec.action_space, greedy)
-    return LoadedRun(config, played_in, executor, checkpoints.latest)
+    return LoadedRun(config, played_in, executor, step)
 
 
 def check_fits(trained: EnvSpec, played: EnvSpec) -> None:
@@ -85,12 +87,14 @@ class TeamPolicy:
         self.reset()
 
     @classmethod
-    def load(cls, run: Path | str, greedy: bool = True, seed: int = 0) -> "TeamPolicy":
-        """The newest policy of a run folder; `seed` decides what it samples.
+    def load(
+        cls, run: Path | str, greedy: bool = True, seed: int = 0, trust: bool = False
+    ) -> "TeamPolicy":
+        """The newest policy of a run folder; `seed` decides what it samples; `trust` as `load_run`.
 
         Raises UserError if the folder is not a run.
         """
-        loaded = load_run(run, greedy=greedy)
+        loaded = load_run(run, greedy=greedy, trust=trust)
         return cls(loaded.executor, loaded.env.spec.n_agents, seed)
 
     def reset(self) -> None:
@@ -145,14 +149,17 @@ class Policy:
         self.reset()
 
     @classmethod
-    def load(cls, run: Path | str, greedy: bool = True, seed: int = 0) -> "Policy":
+    def load(
+        cls, run: Path | str, greedy: bool = True, seed: int = 0, trust: bool = False
+    ) -> "Policy":
         """The newest policy of a run folder; load one for each agent, with a seed of its own.
 
-        `seed` decides the samples of the latent state, and of the actions unless `greedy`.
+        `seed` decides the samples of the latent state, and of the actions unless `greedy`; `trust`
+        is for `load_run`.
         Raises UserError if the folder is not a run, or one of an algorithm whose agents cannot act
         alone.
         """
-        loaded = load_run(run, greedy=greedy)
+        loaded = load_run(run, greedy=greedy, trust=trust)
         if not isinstance(loaded.executor, LocalExecutor):
             raise UserError(
                 f"{loaded.config.algo} executes centrally, there is no policy of one agent: "

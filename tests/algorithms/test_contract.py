@@ -72,7 +72,7 @@ def learner_of(folder: Path) -> dict[str, np.ndarray]:
     """All that learning changes, from the newest checkpoint, by name."""
     training = programs(read_config(folder)).training
     shape = jax.eval_shape(training.init, jax.random.key(0))
-    state = Checkpoints(folder / "checkpoints").restore("state", shape)
+    _, state = Checkpoints(folder / "checkpoints").restore("state", shape)
     return {name: np.asarray(leaf) for name, leaf in named(state.learner)}
 
 

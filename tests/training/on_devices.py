@@ -38,7 +38,7 @@ def main(algo, n_seeds, n_devices, folder):
     found = dict(metrics) | run.diagnose(states) | dict(named(states.learner))
     lies_on = {d.id for leaf in jax.tree.leaves(states) for d in leaf.sharding.device_set}
     about = {"devices": len(lies_on), "compiled": len(compiled)}
-    save(run.training, states, [Checkpoints(folder / "checkpoints", 1, create=True)])
+    save(run.training, states, [Checkpoints.to_write(folder / "checkpoints", 1)])
     np.savez(
         folder / "numbers.npz",
         **{k.replace("/", "|"): np.asarray(v) for k, v in found.items()},

@@ -44,7 +44,7 @@ def test_devices_share_batches_and_seeds(tmp_path, algo, n_seeds, n_devices):
 
     shape = programs(tiny(algo)).init.eval_shape(jax.random.key(0)[None])
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shape)
-    restored = Checkpoints(tmp_path / "many" / "checkpoints", 1).restore("state", like)
+    _, restored = Checkpoints(tmp_path / "many" / "checkpoints", 1).restore("state", like)
     for name, leaf in named(restored.learner):  # on the one device that is here
         assert_array_equal(leaf, many[name][0])
 

@@ -74,7 +74,7 @@ def replay_of(config, folder):
     """The newest checkpoint's, in order."""
     training = programs(config).training
     shape = jax.eval_shape(training.init, jax.random.key(0))
-    replay = Checkpoints(folder / "checkpoints").restore("state", shape).replay
+    replay = Checkpoints(folder / "checkpoints").restore("state", shape)[1].replay
     assert (replay.size < replay.rows.reward.shape[1]).all()  # nothing is overwritten yet
     return jax.device_get(replay)
 

@@ -11,7 +11,6 @@ from mabl.algorithms.presets import preset
 from mabl.envs import registry as envs
 from mabl.runs.checkpoint import named
 from mabl.runs.folder import read_config, write_config
-from mabl.training.loop import repeat
 from mabl.training.programs import programs
 
 CONFIG = tiny("mabl")
@@ -57,15 +56,3 @@ def test_first_states_have_no_weak_types(env):
     training = programs(preset("quick", env, "mappo")).training
     state = jax.eval_shape(training.init, jax.random.key(0))
     assert not [name for name, leaf in named(state) if getattr(leaf, "weak_type", False)]
-
-
-def test_an_update_is_traced_once():
-    traced = []
-
-    def update(carry, key):
-        traced.append(key)
-        return carry + 1, {"carry": carry}
-
-    carry, metrics = jax.jit(lambda n: repeat(update, 5, jax.random.key(0), n))(3)
-    assert len(traced) == 1
-    assert carry == 8 and metrics["carry"] == (5 + 6 + 7) / 3

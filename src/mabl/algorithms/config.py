@@ -5,6 +5,7 @@ import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from math import inf
+from reprlib import repr as brief
 from typing import Any, ClassVar, Literal, TypeVar
 
 from mabl.behaviour.mappo import MAPPOConfig
@@ -47,10 +48,13 @@ class TrainingConfig:
     """Environment steps between checkpoints."""
     keep_checkpoints: int = 2
     """Checkpoints kept, newest first."""
+    max_skipped_updates: int = 20
+    """Gradients in a row that may be left out as they are not finite, before the run stops."""
 
     def __post_init__(self) -> None:
         require_positive(self, "num_envs", "collect_steps", "replay_capacity", "reward_scale")
         require_positive(self, "diagnose_every", "checkpoint_every", "keep_checkpoints")
+        require_positive(self, "max_skipped_updates")
         require_between(self, 0, inf, "model_updates", "policy_updates", "prefill_steps")
         require_between(self, 0, inf, "pretrain_updates")
 
@@ -132,7 +136,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
     Raises UserError for unknown fields and for values of another type than the field's.
     """
     if not isinstance(data, Mapping):
-        raise UserError(f"config {path or 'file'} is {data!r}: give a mapping of fields")
+        raise UserError(f"config {path or 'file'} is {brief(data)}: give a mapping of fields")
     hints = typing.get_type_hints(cls)
     names = [f.name for f in fields(cls)]  # pyright: ignore[reportArgumentType]
     for name in data:
@@ -150,7 +154,7 @@ def _value(hint: Any, value: Any, path: str) -> Any:
     if typing.get_origin(hint) is Literal:
         if value in typing.get_args(hint):
             return value
-        raise unknown_name(path, str(value), typing.get_args(hint))
+        raise unknown_name(path, brief(value), typing.get_args(hint))
     if float in options and type(value) is int:
         return float(value)
     if type(value) in options:
@@ -159,4 +163,4 @@ def _value(hint: Any, value: Any, path: str) -> Any:
         item = typing.get_args(hint)[0]
         return tuple(_value(item, part, f"{path}[{i}]") for i, part in enumerate(value))
     expected = " or ".join(getattr(option, "__name__", str(option)) for option in options)
-    raise UserError(f"config field {path} is {value!r}: give {expected}")
+    raise UserError(f"config field {path} is {brief(value)}: give {expected}")

@@ -15,6 +15,7 @@ from mabl.envs.base import EnvSpec
 from mabl.execution import Policy
 from mabl.imagination import Dream, Imagined
 from mabl.nets.mlp import MLP, Features, parts_of, widths_of
+from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
 from mabl.types import Metrics, PRNGKey, Replayed, Trajectory
 from mabl.world_models.base import decoder_losses, kl_losses, observe_batch
@@ -63,7 +64,7 @@ class MAG(NamedTuple):
             False,
             key_error,
         )
-        opt = optax.adam(config.learning_rate).init(eqx.filter(error, eqx.is_array))
+        opt = guarded(optax.adam(config.learning_rate)).init(eqx.filter(error, eqx.is_array))
         return LookaheadLearner(base, error, opt)
 
     def policy(self, learner: LookaheadLearner) -> Policy:
@@ -94,7 +95,7 @@ class MAG(NamedTuple):
             return optax.huber_loss(guess, realised).mean()
 
         value, gradient = eqx.filter_value_and_grad(loss)(learner.error)
-        optimiser = optax.adam(self.config.lookahead.learning_rate)
+        optimiser = guarded(optax.adam(self.config.lookahead.learning_rate))
         step, error_opt = optimiser.update(gradient, learner.error_opt)
         metrics["world_model/loss_predicted_error"] = value
         return LookaheadLearner(base, eqx.apply_updates(learner.error, step), error_opt), metrics

@@ -19,6 +19,7 @@ from mabl.envs.base import EnvSpec
 from mabl.execution import Policy
 from mabl.imagination import Dream, Imagined, Step, imagine_trajectory
 from mabl.nets.categorical import still
+from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
 from mabl.rows import TimeStep, is_last
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
@@ -154,8 +155,10 @@ class ModelBased(NamedTuple):
 
     def _optimiser(self) -> optax.GradientTransformation:
         config = self.config.world_model
-        return optax.chain(
-            optax.clip_by_global_norm(config.grad_clip), optax.adam(config.learning_rate)
+        return guarded(
+            optax.chain(
+                optax.clip_by_global_norm(config.grad_clip), optax.adam(config.learning_rate)
+            )
         )
 
 

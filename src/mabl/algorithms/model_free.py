@@ -27,6 +27,7 @@ from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
 from mabl.execution import Policy
 from mabl.nets.normaliser import Normaliser
+from mabl.nets.optimiser import guarded
 from mabl.replay import Replay
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey, TeamView
@@ -208,9 +209,11 @@ class ModelFree:
 
     def _optimiser(self) -> optax.GradientTransformation:
         config = self.config.recurrent_mappo
-        return optax.chain(
-            optax.clip_by_global_norm(config.grad_clip),
-            optax.adam(config.learning_rate, eps=1e-5),
+        return guarded(
+            optax.chain(
+                optax.clip_by_global_norm(config.grad_clip),
+                optax.adam(config.learning_rate, eps=1e-5),
+            )
         )
 
 

@@ -21,6 +21,7 @@ from mabl.losses.ppo import clipped_surrogate
 from mabl.losses.returns import lambda_returns
 from mabl.nets.mlp import Features, widths_of
 from mabl.nets.normaliser import Normaliser
+from mabl.nets.optimiser import guarded
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 
@@ -207,7 +208,7 @@ def optimisers(
     critic = optax.chain(
         optax.clip_by_global_norm(config.grad_clip), optax.adam(config.critic_learning_rate)
     )
-    return actor, critic
+    return guarded(actor), guarded(critic)
 
 
 def experience(

@@ -16,6 +16,7 @@ from mabl.envs.base import ActionSpace
 from mabl.errors import require_between, require_positive
 from mabl.losses.returns import lambda_returns
 from mabl.nets.mlp import MLP, Features, Part, Width, parts_of, widths_of
+from mabl.nets.optimiser import guarded
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 
 
@@ -210,8 +211,8 @@ class QMIX(NamedTuple):
 
 def optimiser(config: QMIXConfig) -> optax.GradientTransformation:
     """Adam behind gradient clipping."""
-    return optax.chain(
-        optax.clip_by_global_norm(config.grad_clip), optax.adam(config.learning_rate)
+    return guarded(
+        optax.chain(optax.clip_by_global_norm(config.grad_clip), optax.adam(config.learning_rate))
     )
 
 

@@ -127,9 +127,19 @@ def write_row(rows: TimeStep, index: Any, row: TimeStep, spec: EnvSpec) -> None:
                 f"{spec.name} gave {name} of shape {value.shape}, its spec says {slot.shape}"
             )
         if name in ("obs", "state", "reward") and not all_finite(value):
-            where = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
-            raise UserError(f"{spec.name} gave {name}{list(where)} = {value[where]}")
+            raise UserError(f"{spec.name} gave {first_not_finite(name, value, spec)}")
         slots[index] = value
+
+
+def first_not_finite(name: str, value: np.ndarray, spec: EnvSpec) -> str:
+    """Where a field of a row has a number that is not one, e.g. `obs[3] = nan for agent 1`."""
+    where = np.argwhere(~np.isfinite(value))[0].tolist()
+    number = value[tuple(where)]
+    if name == "state":
+        return f"{name}{where} = {number}"
+    agent, *rest = where
+    named = f" ({spec.agent_ids[agent]})" if spec.agent_ids else ""
+    return f"{name}{rest or ''} = {number} for agent {agent}{named}"
 
 
 def all_finite(values: np.ndarray) -> bool:

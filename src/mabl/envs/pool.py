@@ -112,7 +112,11 @@ class Bench:
                 row = env.reset(int(self._slots.seed[index]))
             else:
                 row = env.step(self._slots.action[index])
-            write_row(self._slots.rows, index, row, self._hosted.spec)
+            try:
+                write_row(self._slots.rows, index, row, self._hosted.spec)
+            except UserError as error:
+                seed = self._slots.seed[index]
+                raise UserError(f"{error}, in the episode of seed {seed}") from error
         except UserError:
             raise
         except Exception:

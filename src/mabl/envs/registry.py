@@ -166,9 +166,14 @@ def family_of(name: str) -> str:
     return re.split("[/:]", name, maxsplit=1)[0]
 
 
+def names_code(name: str) -> bool:
+    """Whether making that environment imports a module that the name chooses."""
+    return ":" in name
+
+
 def family(name: str) -> Callable[..., Any]:
     """Where an environment of that name would be found."""
-    known = ADAPTERS if ":" in name else FAMILIES
+    known = ADAPTERS if names_code(name) else FAMILIES
     return known.get(family_of(name), dict)
 
 
@@ -181,7 +186,7 @@ def make(name: str, kwargs: Sequence[str] = ()) -> CompiledEnv | Hosted:
         raise UserError('a script that trains must do so under if __name__ == "__main__":')
     given = parse_kwargs(kwargs)
     adapter, _, target = name.partition(":")
-    if adapter in ADAPTERS and ":" in name:
+    if adapter in ADAPTERS and names_code(name):
         return ADAPTERS[adapter](name, target, **given)
     entries = family(name)()
     if name not in entries:

@@ -1,76 +1,190 @@
-"""Checkpoints: all that decides a run's future, written atomically with Orbax, the last K kept.
+"""Checkpoints: all that decides a run's future, written whole or not at all, the last K kept.
 
-Each holds two items: `policy` (what acting needs: filter and actor) and `state` (everything).
-Arrays are stored under readable names in flat dictionaries; nothing is pickled.
+checkpoints/step_N/policy.safetensors   what acting needs: filter and actor
+                   state.safetensors    everything
+                   checksums.json       size and SHA-256 of both
+
+Arrays are stored under readable names. Reading one runs no code, follows no links, and takes no
+more memory than the files have bytes.
 """
 
+import hashlib
+import json
+import os
+import re
+import shutil
+import warnings
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
 from mabl.errors import UserError
 
 T = TypeVar("T")
 
+ITEMS = ("policy", "state")
+CHECKSUMS = "checksums.json"
+CHECKSUMS_SIZE = 4096
+"""Bytes of it, at most."""
+PREFIX = "step_"
+UNFINISHED = "unfinished_"
+"""Of a checkpoint's folder while it is written."""
+
+
+class Damaged(Exception):
+    """A checkpoint is not as it was written."""
+
 
 class Checkpoints:
     """The checkpoints of one run folder."""
 
-    def __init__(self, folder: Path, keep: int = 2, create: bool = False):
-        self.folder = folder.absolute()
-        if not create and not self.folder.is_dir():
+    def __init__(self, folder: Path, keep: int = 2):
+        """Raises UserError if there is no such folder."""
+        self.folder, self._keep = folder, keep
+        if not folder.is_dir():
             raise UserError(f"{folder.parent} has no checkpoints: train it first with mabl train")
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep, create=create, enable_async_checkpointing=False
-        )
-        self._manager = ocp.CheckpointManager(
-            self.folder, options=options, item_names=("policy", "state")
-        )
+
+    @classmethod
+    def to_write(cls, folder: Path, keep: int) -> "Checkpoints":
+        """To be written by this process alone: what another did not finish is removed."""
+        folder.mkdir(exist_ok=True)
+        for unfinished in folder.glob(f"{UNFINISHED}*"):
+            shutil.rmtree(unfinished)
+        return cls(folder, keep)
 
     @property
-    def latest(self) -> int:
-        """Environment steps of the newest checkpoint."""
-        step = self._manager.latest_step()
-        if step is None:
-            raise UserError(f"{self.folder.parent} has no finished checkpoint: train it again")
-        return step
+    def steps(self) -> list[int]:
+        """Environment steps of all checkpoints, newest first."""
+        named = (
+            re.fullmatch(f"{PREFIX}(0|[1-9][0-9]*)", path.name) for path in self.folder.iterdir()
+        )
+        return sorted((int(match[1]) for match in named if match), reverse=True)
 
-    @property
-    def any(self) -> bool:
-        """Whether there is a finished checkpoint."""
-        return self._manager.latest_step() is not None
+    def at(self, step: int) -> Path:
+        """The folder of one checkpoint."""
+        return self.folder / f"{PREFIX}{step}"
 
     def save(self, step: int, policy: Any, state: Any) -> None:
-        """Write one checkpoint; it exists whole or not at all."""
-        self._manager.save(
-            step,
-            args=ocp.args.Composite(
-                policy=ocp.args.StandardSave(to_arrays(policy)),
-                state=ocp.args.StandardSave(to_arrays(state)),
-            ),
-        )
-
-    def restore(self, item: str, like: T) -> T:
-        """An item of the newest checkpoint, in the structure of `like` (arrays or their shapes)."""
-        here = jax.sharding.SingleDeviceSharding(jax.devices()[0])  # wherever they lay
-        wanted = {
-            name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here)
-            for name, x in jax.eval_shape(to_arrays, like).items()
-        }
-        args = ocp.args.Composite(**{item: ocp.args.StandardRestore(wanted)})
+        """Write one checkpoint, then let go of the oldest. Raises OSError, and leaves no trace."""
+        unfinished = self.folder / f"{UNFINISHED}{step}"
         try:
-            arrays = self._manager.restore(self.latest, args=args)[item]
-        except (ValueError, KeyError, FileNotFoundError) as error:
-            reason = str(error).partition("\n")[0][:200]
-            raise UserError(
-                f"checkpoint {self.folder}/{self.latest} does not fit this run's config "
-                f"({reason}): evaluate it with the mabl that wrote it"
-            ) from error
-        return from_arrays(like, arrays)
+            unfinished.mkdir()
+            written = {}
+            for item, tree in zip(ITEMS, (policy, state), strict=True):
+                path = unfinished / f"{item}.safetensors"
+                write(path, to_arrays(tree))
+                written[path.name] = fingerprint(path)
+            (unfinished / CHECKSUMS).write_text(json.dumps(written))
+            for path in (*unfinished.iterdir(), unfinished):
+                flush_to_disk(path)
+            shutil.rmtree(self.at(step), ignore_errors=True)  # of a run that was resumed before it
+            unfinished.rename(self.at(step))
+        except BaseException:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise
+        flush_to_disk(self.folder)
+        for old in self.steps[self._keep :]:
+            shutil.rmtree(self.at(old))
+
+    def restore(self, item: str, like: T) -> tuple[int, T]:
+        """An item of the newest checkpoint that is whole, structured like `like`, and its step.
+
+        `like` has arrays or their shapes. Warns of damaged checkpoints. Raises UserError if none is
+        whole, or if that one has other arrays than `like`.
+        """
+        for step in self.steps:
+            try:
+                check_whole(self.at(step))
+                path = self.at(step) / f"{item}.safetensors"
+                arrays = read(path, jax.eval_shape(to_arrays, like))
+            except Damaged as damage:
+                warnings.warn(f"{damage}: an older checkpoint is needed", stacklevel=2)
+            else:
+                return step, from_arrays(like, arrays)
+        raise UserError(f"{self.folder.parent} has no whole checkpoint: train it again")
+
+    def forget_after(self, step: int) -> None:
+        """Remove damaged checkpoints past `step`: the run will produce them again."""
+        for later in self.steps:
+            if later > step:
+                shutil.rmtree(self.at(later))
+
+
+def check_whole(checkpoint: Path) -> None:
+    """Raises Damaged unless every file of a checkpoint is as it was written."""
+    files = [checkpoint / f"{item}.safetensors" for item in ITEMS]
+    checksums = checkpoint / CHECKSUMS
+    if checkpoint.is_symlink():
+        raise Damaged(f"{checkpoint} is a link")
+    for path in (checksums, *files):
+        if path.is_symlink() or not path.is_file():
+            raise Damaged(f"{path} is missing or a link")
+    try:
+        with checksums.open("rb") as file:
+            written = json.loads(file.read(CHECKSUMS_SIZE))
+    except (ValueError, RecursionError) as error:
+        raise Damaged(f"{checksums} is damaged") from error
+    if not isinstance(written, dict) or written.keys() != {path.name for path in files}:
+        raise Damaged(f"{checksums} is damaged")
+    for path in files:
+        if fingerprint(path) != written[path.name]:
+            raise Damaged(f"{path} is damaged, or its checksum in {CHECKSUMS} is")
+
+
+def fingerprint(path: Path) -> dict[str, Any]:
+    """By which a file is known to be as it was written."""
+    with path.open("rb") as file:
+        return {
+            "sha256": hashlib.file_digest(file, "sha256").hexdigest(),
+            "bytes": path.stat().st_size,
+        }
+
+
+def write(path: Path, arrays: dict[str, jax.Array]) -> None:
+    """Arrays to a safetensors file. Raises OSError."""
+    try:
+        save_file({name: np.asarray(x, order="C") for name, x in arrays.items()}, path)
+    except SafetensorError as error:
+        code = re.search(r"os error (\d+)", str(error))
+        if code is None:
+            raise
+        raise OSError(int(code[1]), os.strerror(int(code[1])), str(path)) from error
+
+
+def read(path: Path, wanted: dict[str, jax.ShapeDtypeStruct]) -> dict[str, np.ndarray]:
+    """Arrays of a file. Raises UserError unless it has exactly those that are wanted."""
+    try:
+        with safe_open(path, "numpy") as file:
+            if other := set(file.keys()) ^ set(wanted):
+                raise misfit(path, min(other))
+            arrays = {name: file.get_tensor(name) for name in wanted}
+    except SafetensorError as error:
+        raise Damaged(f"{path} is damaged ({error})") from error
+    for name, array in arrays.items():
+        if (array.shape, array.dtype) != (wanted[name].shape, wanted[name].dtype):
+            raise misfit(path, name)
+    return arrays
+
+
+def misfit(path: Path, name: str) -> UserError:
+    """What to say of a file that has another array, or none."""
+    return UserError(
+        f"{path} does not fit this run's config ({name}): use it with the mabl that wrote it"
+    )
+
+
+def flush_to_disk(path: Path) -> None:
+    """Have a file or folder outlive a loss of power."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def to_arrays(tree: Any) -> dict[str, jax.Array]:

@@ -1,11 +1,13 @@
 """A run's folder: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP with config, versions, metrics, checkpoints.
 
 config.yaml      every field of the configuration that the algorithm reads
+config.signature where the environment is code: that this user's mabl wrote it
 versions.yaml    package versions, git commit, machine
 metrics.jsonl    one JSON object a line, `step` in environment steps
 curves.png       refreshed during training
 tensorboard/     the same metrics
 checkpoints/     the newest last
+.lock            held by whoever writes
 """
 
 import dataclasses
@@ -21,9 +23,14 @@ import yaml
 
 from mabl.algorithms.config import Config, from_dict
 from mabl.algorithms.registry import unread
+from mabl.envs.registry import names_code
 from mabl.errors import UserError
+from mabl.runs.trust import is_own, sign
 
-RECORDED_PACKAGES = ("mabl", "jax", "jaxlib", "equinox", "optax", "orbax-checkpoint", "jaxmarl")
+CONFIG_SIZE = 1_000_000
+"""Characters of a config, at most."""
+
+RECORDED_PACKAGES = ("mabl", "jax", "jaxlib", "equinox", "optax", "jaxmarl")
 
 
 def create(config: Config, seed: int) -> Path:
@@ -59,19 +66,30 @@ def make_unused(parent: Path, stamp: str) -> Path:
             folder = parent / f"{stamp}-{n}"
 
 
-def read_config(folder: Path) -> Config:
-    """The configuration of a run. Raises UserError if the folder is not a run."""
+def read_config(folder: Path, trust: bool = False) -> Config:
+    """The configuration of a run.
+
+    Raises UserError if the folder is not a run, and unless `trust`, if it names code of this
+    machine to be run, and this user's mabl did not write it.
+    """
     path = folder / "config.yaml"
     if not path.is_file():
         raise UserError(f"{folder} is not a run folder (no config.yaml): give one of mabl train's")
     try:
-        data = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        with path.open(encoding="utf-8") as file:
+            data = yaml.safe_load(file.read(CONFIG_SIZE))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise UserError(f"{path} is not readable YAML: restore it or train again") from error
     try:
-        return from_dict(Config, data)
+        config = from_dict(Config, data)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
+    if names_code(config.env) and not trust and not is_own(folder):
+        raise UserError(
+            f"{folder} was not written by your mabl, and its environment {config.env} is code that "
+            "would be run: look at its config.yaml, then add --trust"
+        )
+    return config
 
 
 def write_config(folder: Path, config: Config) -> None:
@@ -80,6 +98,8 @@ def write_config(folder: Path, config: Config) -> None:
     for name in unread(config.algo):
         del data[name]
     write_yaml(folder / "config.yaml", data)
+    if names_code(config.env):
+        sign(folder)
 
 
 def write_yaml(path: Path, data: dict) -> None:

@@ -2,10 +2,15 @@
 
 import json
 import math
+import os
+import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboardX.summary import scalar
 
 from mabl.errors import UserError
 
@@ -24,22 +29,44 @@ class MetricsLog:
             temporary.write_text("".join(map(_line, kept)))
             temporary.replace(self._path)
         self._file = self._path.open("a")
-        self._tensorboard = SummaryWriter(
-            str(folder / "tensorboard"), purge_step=None if resume_at is None else resume_at + 1
-        )
+        self._tensorboard = TensorBoard(folder / "tensorboard", resume_at)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Log metrics at an environment step; what is not finite is left out."""
         finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
         self._file.write(_line({"step": step, **finite}))
         self._file.flush()
-        for name, value in finite.items():
-            self._tensorboard.add_scalar(name, value, step)
+        self._tensorboard.write(step, finite)
 
     def close(self) -> None:
         """Flush and release the files."""
         self._file.close()
         self._tensorboard.close()
+
+
+class TensorBoard:
+    """An event file, written at once: tensorboardX's own writer hangs when its thread fails."""
+
+    def __init__(self, folder: Path, resume_at: int | None = None):
+        """With `resume_at`, what other files have past that step is not to be shown."""
+        folder.mkdir(exist_ok=True)
+        self._writer = EventsWriter(str(folder / "events"), f".{os.getpid()}")
+        if resume_at is not None:
+            start = SessionLog(status=SessionLog.START)
+            self._event(resume_at + 1, session_log=start)
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Scalars of one step."""
+        for name, value in metrics.items():
+            self._event(step, summary=scalar(name, value))
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Release the file."""
+        self._writer.close()
+
+    def _event(self, step: int, **content: Any) -> None:
+        self._writer.write_event(Event(wall_time=time.time(), step=step, **content))
 
 
 def read(folder: Path) -> list[Row]:
@@ -48,12 +75,14 @@ def read(folder: Path) -> list[Row]:
     if not path.exists():
         return []
     rows = []
-    lines = path.read_text().splitlines()
+    lines = path.read_bytes().splitlines()
     for number, line in enumerate(lines, start=1):
         try:
             row = json.loads(line)
             row["step"] = int(row["step"])
-        except (ValueError, KeyError, TypeError) as error:
+            if not all(type(value) in (int, float) for value in row.values()):
+                raise TypeError("not a number")
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             if number == len(lines):
                 break  # torn by a crash in mid-write: that row's cycle will run again
             raise UserError(f"{path} line {number} is not a row of metrics: remove it") from error

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from mabl import replay as replays
 from mabl.algorithms.base import Algorithm, Experience
@@ -13,6 +13,7 @@ from mabl.envs.base import CompiledEnv
 from mabl.envs.host import Hosted
 from mabl.execution import Executor, executor_of
 from mabl.host_rollout import start_hosted
+from mabl.nets.optimiser import guards
 from mabl.replay import Replay
 from mabl.rollout import Collector, Rollout, rollout, start
 from mabl.types import Metrics, PRNGKey
@@ -85,7 +86,7 @@ class Training(NamedTuple):
         """Lines 4-14: store what was collected, `n_model` model updates, `n_policy` policy updates.
 
         Metrics are means over the cycle's updates (NaN if there were none) and sums over the
-        episodes that ended in it.
+        cycle.
         """
         key, _, key_model, key_policy = cycle_keys(state.key)
         replay = state.replay
@@ -93,9 +94,10 @@ class Training(NamedTuple):
             replay = jax.vmap(replays.cut)(replay, state.collectors.row.truncated)
         replay = self.store(replay, collected)
         experience = Experience(replay, state.collectors, collected)
+        before = state.learner
         learner, model_metrics = repeat(
             lambda learner, key: self.algorithm.update_model(learner, experience, key),
-            state.learner,
+            before,
             key_model,
             n_model,
         )
@@ -113,7 +115,8 @@ class Training(NamedTuple):
             env_steps=state.env_steps + steps_in(collected),
             model_updates=state.model_updates + n_model,
         )
-        return state, model_metrics | policy_metrics | episode_sums(collected)
+        skipped = {"train/skipped_updates": skips(learner) - skips(before)}
+        return state, model_metrics | policy_metrics | skipped | sums_over(collected)
 
     def collect(
         self, learner: Any, collectors: Collector, key: PRNGKey
@@ -149,19 +152,30 @@ class Training(NamedTuple):
 
 def steps_in(collected: Rollout) -> Int[Array, ""]:
     """Joint environment steps of a rollout: its valid rows less its resets."""
-    valid = jnp.arange(collected.rows.is_first.shape[1])[None] < collected.count[:, None]
-    return (valid & ~collected.rows.is_first).sum(dtype=jnp.int32)
+    return (valid_rows(collected) & ~collected.rows.is_first).sum(dtype=jnp.int32)
 
 
-def episode_sums(collected: Rollout) -> Metrics:
-    """Sums over the episodes that ended in a rollout."""
-    episodes = collected.episodes
+def valid_rows(collected: Rollout) -> Bool[Array, "E R"]:
+    """Which rows of a rollout were collected."""
+    return jnp.arange(collected.rows.is_first.shape[1])[None] < collected.count[:, None]
+
+
+def sums_over(collected: Rollout) -> Metrics:
+    """Of a rollout: episodes that ended in it, and rows that are not finite."""
+    episodes, rows = collected.episodes, collected.rows
+    finite = [jnp.isfinite(x).all(range(2, x.ndim)) for x in (rows.obs, rows.state, rows.reward)]
     return {
+        "rows/not_finite": (valid_rows(collected) & ~jnp.stack(finite).all(0)).sum(),
         "episodes/count": episodes.ended.sum(),
         "episodes/return": episodes.episode_return.sum(),
         "episodes/length": episodes.length.sum(),
         "episodes/score": episodes.score.sum(),
     }
+
+
+def skips(learner: Any) -> Int[Array, ""]:
+    """Steps of optimisers that were left out so far."""
+    return sum((guard.skipped for guard in guards(learner).values()), jnp.int32(0))
 
 
 def repeat(

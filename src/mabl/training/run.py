@@ -1,6 +1,7 @@
 """A training run from start to finish: folders, progress, metrics, checkpoints, interruption."""
 
 import signal
+import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,8 +10,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool
 from rich.console import Console
 
 from mabl.algorithms.config import Config
@@ -19,9 +18,11 @@ from mabl.devices import SEEDS
 from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
 from mabl.runs import folder
-from mabl.runs.checkpoint import Checkpoints, named
+from mabl.runs.checkpoint import Checkpoints
+from mabl.runs.lock import writing
 from mabl.runs.metrics import MetricsLog, Row, read
 from mabl.training import curves
+from mabl.training.faults import check_finite, disks_explained
 from mabl.training.loop import Training, TrainState
 from mabl.training.memory import check_memory, free_memory, tree_bytes
 from mabl.training.programs import grid_of, programs
@@ -36,7 +37,8 @@ class Outcome:
     """How a run ended."""
 
     folders: list[Path]
-    interrupted: bool
+    stopped_by: signal.Signals | None
+    """What asked it to end early, if anything did."""
 
 
 def train(config: Config, console: Console | None = None) -> Outcome:
@@ -48,33 +50,50 @@ def train(config: Config, console: Console | None = None) -> Outcome:
     for path in folders:
         console.print(f"run folder {path}", highlight=False, soft_wrap=True)
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
-    return _run(config, programs(config).init(keys), folders, console)
+    with writing(folders):
+        return _run(config, programs(config).init(keys), folders, console)
 
 
 def resume(
-    path: Path | str,
+    run: Path | str,
     total_steps: int | None = None,
     num_devices: int | None = None,
+    trust: bool = False,
     console: Console | None = None,
 ) -> Outcome:
-    """Continue one run from its newest checkpoint, as configured or as told."""
+    """Continue one run from its newest whole checkpoint, as configured or as told.
+
+    Where there is none yet, it begins. With `trust`, the run may name code of this machine as its
+    environment, whoever wrote it.
+    """
     console = console or Console(stderr=True)
-    path = Path(path)
-    config = folder.read_config(path)
+    path = Path(run)
+    config = folder.read_config(path, trust)
     told = {"total_steps": total_steps, "num_devices": num_devices}
     config = replace(config, **{name: new for name, new in told.items() if new is not None})
-    checkpoints = Checkpoints(path / "checkpoints", config.training.keep_checkpoints)
-    if checkpoints.latest >= config.total_steps:
-        raise UserError(
-            f"{path} has already done {checkpoints.latest} of {config.total_steps} steps: "
-            "give a larger --total-steps"
-        )
     shape = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), check_memory_of(config, console)
     )
-    state = checkpoints.restore("state", shape)
-    folder.write_config(path, config)
-    return _run(config, jax.tree.map(lambda x: x[None], state), [path], console, resumed=True)
+    with writing([path]):
+        checkpoints = checkpoints_of(path, config)
+        if checkpoints.steps:
+            step, state = checkpoints.restore("state", shape)
+            states = jax.tree.map(lambda x: x[None], state)
+            checkpoints.forget_after(step)
+        else:
+            step, states = 0, programs(config).init(jax.random.key(config.seed)[None])
+        if step >= config.total_steps:
+            raise UserError(
+                f"{path} has already done {step} of {config.total_steps} steps: "
+                "give a larger --total-steps"
+            )
+        folder.write_config(path, config)
+        return _run(config, states, [path], console, resumed=True)
+
+
+def checkpoints_of(path: Path, config: Config) -> Checkpoints:
+    """Those of a run folder, to be written."""
+    return Checkpoints.to_write(path / "checkpoints", config.training.keep_checkpoints)
 
 
 def check_memory_of(config: Config, console: Console) -> TrainState:
@@ -107,18 +126,19 @@ def _run(
     run = programs(config)
     training, total_steps = run.training, config.total_steps
     states = run.place(states)
-    keep = config.training.keep_checkpoints
-    checkpoints = [Checkpoints(path / "checkpoints", keep, create=True) for path in folders]
+    checkpoints = [checkpoints_of(path, config) for path in folders]
     step = int(states.env_steps.min())
     logs = [MetricsLog(path, resume_at=step if resumed else None) for path in folders]
+    warned = False
     saved, drawn, began = step, time.monotonic(), time.monotonic()
     console.print("compiling (cached for the next run) ...", highlight=False)
     with (
+        disks_explained(checkpoints),
         run.open_cycle(config) as cycle,
         _Interruption(console) as interruption,
         Progress(console, total_steps, training.env.spec.score_name) as progress,
     ):
-        while step < total_steps and not interruption.requested:
+        while step < total_steps and not interruption.received:
             before, cycle_began = step, time.monotonic()
             n_model, n_policy = updates_due(states, training)
             if n_model and int(states.model_updates[0]) < config.training.pretrain_updates:
@@ -130,7 +150,10 @@ def _run(
             ):
                 metrics |= run.diagnose(states)
             metrics = jax.device_get(metrics)
-            check_finite(states, step, checkpoints[0])
+            check_finite(states, metrics, training, checkpoints)
+            if metrics["train/skipped_updates"].any() and not warned:
+                warned = True
+                console.print(f"a gradient was not finite by step {step:,}, and was left out")
             seconds = time.monotonic() - cycle_began
             for k, log in enumerate(logs):
                 row = describe(
@@ -148,17 +171,19 @@ def _run(
                 drawn = time.monotonic()
                 draw_curves(folders, config)
         save(training, states, checkpoints)
-    draw_curves(folders, config)
-    for log in logs:
-        log.close()
-    state = "interrupted" if interruption.requested else "finished"
+        draw_curves(folders, config)
+        for log in logs:
+            log.close()
+    stopped_by = interruption.received
     console.print(
-        f"{state} at {step:,} steps after {duration(time.monotonic() - began)}", highlight=False
+        f"{'interrupted' if stopped_by else 'finished'} at {step:,} steps after "
+        f"{duration(time.monotonic() - began)}",
+        highlight=False,
     )
     for path in folders:
-        hint = f"mabl resume {path}" if interruption.requested else f"mabl eval {path}"
+        hint = f"mabl resume {path}" if stopped_by else f"mabl eval {path}"
         console.print(f"next: {hint}", highlight=False, soft_wrap=True)
-    return Outcome(folders, interruption.requested)
+    return Outcome(folders, stopped_by)
 
 
 def updates_due(states: TrainState, training: Training) -> tuple[int, int]:
@@ -176,24 +201,6 @@ def updates_due(states: TrainState, training: Training) -> tuple[int, int]:
 def longest_lane(states: TrainState) -> int:
     """Rows in the longest lane of the replay of the seed that has the shortest such."""
     return int(states.replay.size.max(-1).min())
-
-
-def check_finite(states: TrainState, step: int, last: Checkpoints) -> None:
-    """Stop a run that diverged before it overwrites its good checkpoints."""
-    if all_finite(states.learner):
-        return
-    name = next(name for name, leaf in named(states.learner) if not np.isfinite(leaf).all())
-    kept = f"its checkpoint at {last.latest} steps is good" if last.any else "none was kept"
-    raise UserError(
-        f"training diverged before step {step} ({name} is not finite); {kept}: "
-        "lower the learning rates"
-    )
-
-
-@jax.jit
-def all_finite(tree: Any) -> Bool[Array, ""]:
-    """Whether every number of a pytree is finite."""
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
 
 
 def crossed(before: int, now: int, every: int) -> bool:
@@ -228,26 +235,31 @@ def draw_curves(folders: list[Path], config: Config) -> None:
 
 
 class _Interruption:
-    """Turns the first Ctrl-C into a request to stop after the cycle; the second is a real one."""
+    """Turns the first Ctrl-C or SIGTERM into a wish to stop after the cycle; the second is real."""
 
-    requested = False
+    received: signal.Signals | None = None
+    """What the wish came as."""
 
     def __init__(self, console: Console):
         self._console = console
+        self._previous: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> "_Interruption":
-        try:
-            self._previous = signal.signal(signal.SIGINT, self._handle)
-        except ValueError:  # not in the main thread: leave signals alone
-            self._previous = None
+        if threading.current_thread() is threading.main_thread():  # the only one that may
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._handle)
         return self
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        del number, frame
-        self.requested = True
-        self._console.print("stopping after this cycle; Ctrl-C again stops at once")
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        del frame
+        self.received = signal.Signals(number)
+        again = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
+        self._console.print(f"stopping after this cycle; {again} again stops at once")
+        self._restore()
+
+    def _restore(self) -> None:
+        while self._previous:
+            signal.signal(*self._previous.popitem())
 
     def __exit__(self, *_: object) -> None:
-        if self._previous is not None:
-            signal.signal(signal.SIGINT, self._previous)
+        self._restore()
