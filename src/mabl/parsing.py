@@ -26,8 +26,10 @@ def parse(fields: Callable[..., T], arguments: Sequence[str], prog: str, **optio
 
 def in_one_line(box: str) -> str:
     """What a message of tyro's says, without its frame, and the flag that it has in mind."""
-    rows = [row.strip(" │╭╮╰╯") for row in box.splitlines()[1:]]
-    ends = [i for i, row in enumerate(rows) if row and not row.strip("─-")] or [len(rows)]
-    message = " ".join(" ".join(rows[: ends[0]]).split())
-    meant = next((row for row in rows[ends[0] :] if row.startswith("--")), "")
+    rows = [row.strip(" │╭╮╰╯") for row in box.splitlines()[1:]]  # after the title
+    rules = [i for i, row in enumerate(rows) if not row.strip("─-")]
+    first = next(i for i in range(len(rows) + 1) if i not in rules)
+    end = next((i for i in rules if i > first), len(rows))
+    message = " ".join(" ".join(rows[first:end]).split())
+    meant = next((row for row in rows[end:] if row.startswith("--") and row.strip("-")), "")
     return f"{message}; there is {meant}" if meant else message
