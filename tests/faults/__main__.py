@@ -20,7 +20,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 from tests.faults.disks import Full, full, limited, read_only
-from tests.faults.killed import kill_again_and_again
+from tests.faults.killed import kill_again_and_again, train
 from tests.runs.test_checkpoint import DAMAGES, FILES
 
 from mabl.runs.checkpoint import Checkpoints
@@ -83,16 +83,16 @@ def damages(place: Path, each: int) -> Result:
 def disks(place: Path) -> list[Result]:
     """Full, limited and read-only."""
     results = []
+    whole = train(place / "room", "mappo", 2000)
     for name, do in (("full disk", full), ("limit on files", limited)):
         began = time.monotonic()
-        (place / name).mkdir()
-        report: Full = do(place / name)
+        report: Full = do(place, whole)
         good = report.refused.code == 2 and report.equal
         detail = {"said": report.refused.said.splitlines()[-1], "kept": report.kept}
         seconds = time.monotonic() - began
         results.append(Result(name, 1, int(good), int(not good), seconds, detail))
     began = time.monotonic()
-    refused = read_only(place / "there", place / "kills" / "killed")
+    refused = read_only(place / "there", whole)
     good = refused.code == 2
     detail = {"said": refused.said.splitlines()[-1]}
     seconds = time.monotonic() - began

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.faults.killed import MABL, newest, numbers, outcome, train
+from tests.faults.killed import MABL, newest, numbers, outcome
 
 
 class Refused(NamedTuple):
@@ -49,27 +49,24 @@ class Full(NamedTuple):
     """Resumed with room, it ended with the numbers of a run that always had room."""
 
 
-def full(place: Path, algo: str = "mappo", steps: int = 2000) -> Full:
-    """A disk fills while a run writes to it; room is made, and the run is resumed."""
+def full(place: Path, whole: Path) -> Full:
+    """A disk fills while a run writes to it; room is made, and the run is resumed.
+
+    `whole` is the same run, which had room.
+    """
     with small_disk(place / "disk", 64) as disk:
-        return refused_and_resumed(place, disk / "run", algo, steps, lambda: fill(disk))
+        return refused_and_resumed(disk / "run", whole, fill=lambda: fill(disk))
 
 
-def limited(place: Path, algo: str = "mappo", steps: int = 2000) -> Full:
+def limited(place: Path, whole: Path) -> Full:
     """The same where no file may be longer than ten blocks, which needs no rights."""
-    return refused_and_resumed(place, place / "run", algo, steps, limit=10)
+    return refused_and_resumed(place / "limited", whole, limit=10)
 
 
 def refused_and_resumed(
-    place: Path,
-    folder: Path,
-    algo: str,
-    steps: int,
-    fill: Callable[[], Path] | None = None,
-    limit: int | None = None,
+    folder: Path, whole: Path, fill: Callable[[], Path] | None = None, limit: int | None = None
 ) -> Full:
     """What became of a run in `folder` when its disk was filled, or files were limited."""
-    whole = train(place / "room", algo, steps)
     folder.mkdir()
     shutil.copy(whole / "config.yaml", folder)
     limited = ["sh", "-c", f'ulimit -f {limit}; exec "$@"', "sh"] if limit else []
@@ -83,7 +80,7 @@ def refused_and_resumed(
     kept = newest(folder / "checkpoints")
     if fill:
         filler.unlink()
-    if kept < steps:
+    if kept < newest(whole / "checkpoints"):
         outcome(["resume", folder])
     return Full(Refused(process.returncode, said), kept, numbers(folder) == numbers(whole))
 

@@ -1,0 +1,65 @@
+"""Run folders, as `mabl resume` meets them after a misfortune."""
+
+import json
+import shutil
+
+import pytest
+from tests.faults.killed import numbers
+from tests.tiny import flags
+
+from mabl import cli
+from mabl.runs.checkpoint import Checkpoints
+from mabl.runs.lock import writing
+
+ENV = "test/coordination"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A short run with two checkpoints."""
+    logdir = tmp_path_factory.mktemp("runs")
+    given = [*flags("mappo", ENV), "--training.checkpoint-every=40", f"--logdir={logdir}"]
+    assert cli.run(["train", *given, "--total-steps=400"]) == 0
+    (folder,) = logdir.glob(f"{ENV}/mappo/seed_0/*")
+    return folder
+
+
+@pytest.fixture
+def run(whole, tmp_path):
+    """A copy of it."""
+    shutil.copytree(whole, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_one_process_writes_and_others_read(run, mabl):
+    with writing([run]):
+        code, _, err = mabl("resume", run, "--total-steps=500")
+        assert code == 2 and f"mabl: {run} is being written by another mabl" in err
+        assert mabl("eval", run, "--episodes=1")[0] == 0
+    assert mabl("resume", run, "--total-steps=500")[0] == 0
+
+
+def test_a_run_without_a_checkpoint_begins_anew(run, whole, mabl):
+    shutil.rmtree(run / "checkpoints")
+    assert mabl("resume", run)[0] == 0
+    assert numbers(run) == numbers(whole)
+
+
+@pytest.mark.filterwarnings("default:.*an older checkpoint is needed")
+def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(run, whole, mabl):
+    checkpoints = Checkpoints(run / "checkpoints")
+    newest, older = checkpoints.steps
+    path = checkpoints.at(newest) / "state.safetensors"
+    path.write_bytes(path.read_bytes()[:-1])
+    out = mabl("eval", run, "--episodes=1", "--json")[1]
+    assert json.loads(out)["step"] == older
+    assert mabl("resume", run)[0] == 0
+    assert numbers(run) == numbers(whole) and checkpoints.steps[0] == newest
+
+
+def test_a_run_without_a_whole_checkpoint_says_so(run, mabl):
+    for path in run.rglob("checksums.json"):
+        path.unlink()
+    with pytest.warns(UserWarning, match="missing or a link"):
+        code, _, err = mabl("resume", run)
+    assert code == 2 and "has no whole checkpoint: train it again" in err
