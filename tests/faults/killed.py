@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -88,6 +89,12 @@ class Report(NamedTuple):
     rows: int
     equal: bool
     """Metrics and the last checkpoint are those of the undisturbed run."""
+
+    @property
+    def lost(self) -> int:
+        """Checkpoints that a kill took away, and an end that differs."""
+        pairs = pairwise(self.steps_after)
+        return sum(after < before for before, after in pairs) + (not self.equal)
 
 
 def kill_again_and_again(

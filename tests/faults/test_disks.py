@@ -32,7 +32,7 @@ def test_a_limit_on_files_stops_the_run_and_loses_nothing(tmp_path, whole):
 def test_a_full_disk_stops_the_run_and_loses_nothing(tmp_path, may_mount, whole):
     (code, said), kept, equal = full(tmp_path, whole)
     assert code == 2 and "Traceback" not in said
-    assert f"(No space left on device); its checkpoint at {kept} is good: make room" in said
+    assert f"(No space left on device); its checkpoint at {kept} is kept: make room" in said
     assert kept > 0 and equal
 
 

@@ -213,7 +213,7 @@ def no_warnings():
         yield
 
 
-KINDS = ("nothing", "folder", "empty", "junk", "link", "fifo")
+KINDS = ("nothing", "folder", "empty", "junk")
 
 
 @settings(FUZZ, max_examples=max(10, CASES // 4))
@@ -226,13 +226,46 @@ def test_run_folders(trained, data):
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     if kind == "folder":
         path.mkdir()
-    elif kind == "link":
-        path.symlink_to(folder.parent / "nothing")
-    elif kind == "fifo":
-        os.mkfifo(path)
     elif kind != "nothing":
         path.write_bytes(b"" if kind == "empty" else data.draw(st.binary(max_size=100)))
     with no_warnings(), pytest.MonkeyPatch.context() as patch:
         patch.setattr("mabl.evaluation.evaluate", refuse)
         ends_well("eval", str(folder))
         ends_well("resume", str(folder), "--total-steps=120")
+
+
+NAMES = [
+    "config.yaml",
+    ".config.yaml",
+    "versions.yaml",
+    "metrics.jsonl",
+    ".metrics.jsonl",
+    "curves.png",
+    ".curves.png",
+    "tensorboard",
+    "checkpoints",
+    "checkpoints/step_7",
+    "checkpoints/unfinished_7",
+    ".lock",
+    "videos",
+    "anything",
+]
+
+
+@pytest.mark.parametrize("command", ["eval", "resume", "play"])
+@pytest.mark.parametrize("kind", ["link to a file", "link to a folder", "pipe"])
+@pytest.mark.parametrize("name", NAMES)
+def test_links_and_pipes_are_refused(name, kind, command, trained, tmp_path):
+    folder, elsewhere = copy_of(trained), tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "file").write_text("precious")
+    path = folder / name
+    if path.exists():
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(elsewhere / "file" if kind == "link to a file" else elsewhere)
+    ends_well(command, str(folder))
+    assert [p.name for p in elsewhere.iterdir()] == ["file"]
+    assert (elsewhere / "file").read_text() == "precious"

@@ -1,9 +1,9 @@
 """Checkpoints are whole or not used, and a stranger's do no harm."""
 
+import errno
 import json
 import os
 import pickle
-import shutil
 from pathlib import Path
 
 import jax
@@ -89,23 +89,47 @@ def test_a_damaged_file_is_named_and_the_checkpoint_before_it_is_used(file, dama
 
 
 @pytest.mark.parametrize("file", FILES)
-def test_a_lost_file_and_a_link_are_damage_too(file, tmp_path):
+def test_a_lost_file_is_damage_too(file, tmp_path):
     checkpoints = written(tmp_path, 10, 20)
-    path = checkpoints.at(20) / file
-    elsewhere = path.rename(tmp_path / "elsewhere")
-    for put in (lambda: None, lambda: path.symlink_to(elsewhere), lambda: os.mkfifo(path)):
-        put()
-        with pytest.warns(UserWarning, match=f"{path} is missing or a link"):
-            assert checkpoints.restore("state", state_at(0))[0] == 10
-        path.unlink(missing_ok=True)
-
-
-def test_a_checkpoint_that_is_a_link_is_not_followed(tmp_path):
-    checkpoints = written(tmp_path, 10, 20)
-    shutil.move(checkpoints.at(20), tmp_path / "elsewhere")
-    checkpoints.at(20).symlink_to(tmp_path / "elsewhere")
-    with pytest.warns(UserWarning, match="step_20 is a link"):
+    (checkpoints.at(20) / file).unlink()
+    with pytest.warns(UserWarning, match=f"{file} is missing"):
         assert checkpoints.restore("state", state_at(0))[0] == 10
+
+
+def test_a_policy_is_whole_if_its_own_file_is(tmp_path):
+    checkpoints = written(tmp_path, 10, 20)
+    (checkpoints.at(20) / "state.safetensors").write_bytes(b"")
+    assert checkpoints.restore("policy", {"w": jnp.zeros(5, jnp.int32)})[0] == 20
+
+
+def test_what_cannot_be_read_is_damage_too(tmp_path, monkeypatch):
+    checkpoints = written(tmp_path, 10, 20)
+
+    def refuse(path):
+        if "step_20" in str(path):
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return whole(path)
+
+    whole = checkpoint.fingerprint
+    monkeypatch.setattr(checkpoint, "fingerprint", refuse)
+    with pytest.warns(UserWarning, match="Input/output error"):
+        assert checkpoints.restore("state", state_at(0))[0] == 10
+
+
+def test_a_step_is_saved_once(tmp_path):
+    checkpoints = written(tmp_path, 10)
+    before = checkpoints.at(10).stat()
+    checkpoints.save(10, {"w": jnp.full(5, 10)}, state_at(10))
+    assert checkpoints.at(10).stat().st_ino == before.st_ino
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path):
+    """Sparse files declare what no disk holds."""
+    checkpoints = written(tmp_path, 10)
+    with (checkpoints.at(10) / "state.safetensors").open("r+b") as file:
+        file.truncate(2**40)
+    with pytest.raises(UserError, match=r"does not fit this run's config \(1099511627776 bytes\)"):
+        checkpoints.restore("state", state_at(0))
 
 
 def test_none_whole_is_said(tmp_path):
@@ -191,6 +215,9 @@ FORGERIES = {
     "names of other places": lambda path: header(
         **{f"../../{path}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}}
     ),
+    "types that numpy lacks": lambda path: (
+        header(steps={"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}) + bytes(4)
+    ),
     "deep nesting": lambda path: len(b"[" * 9999).to_bytes(8, "little") + b"[" * 9999,
 }
 
@@ -199,7 +226,7 @@ FORGERIES = {
 def test_a_strangers_file_is_refused_before_anything_comes_of_it(forgery, tmp_path):
     checkpoints = written(tmp_path, 20)
     forge(checkpoints, FORGERIES[forgery](tmp_path / "owned"))
-    if forgery == "names of other places":
+    if forgery in ("names of other places", "types that numpy lacks"):
         with pytest.raises(UserError, match="does not fit"):
             checkpoints.restore("state", state_at(0))
     else:

@@ -49,7 +49,7 @@ def test_a_run_without_a_checkpoint_begins_anew(run, whole, mabl):
 def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(run, whole, mabl):
     checkpoints = Checkpoints(run / "checkpoints")
     newest, older = checkpoints.steps
-    path = checkpoints.at(newest) / "state.safetensors"
+    path = checkpoints.at(newest) / "policy.safetensors"
     path.write_bytes(path.read_bytes()[:-1])
     out = mabl("eval", run, "--episodes=1", "--json")[1]
     assert json.loads(out)["step"] == older
@@ -60,6 +60,6 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(ru
 def test_a_run_without_a_whole_checkpoint_says_so(run, mabl):
     for path in run.rglob("checksums.json"):
         path.unlink()
-    with pytest.warns(UserWarning, match="missing or a link"):
+    with pytest.warns(UserWarning, match="missing or damaged"):
         code, _, err = mabl("resume", run)
     assert code == 2 and "has no whole checkpoint: train it again" in err

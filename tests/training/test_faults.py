@@ -83,7 +83,7 @@ def test_an_environment_that_gives_no_numbers_ends_the_run(mabl, monkeypatch, tm
 
 def test_a_disk_that_takes_no_more_is_said_with_what_is_kept(tmp_path):
     checkpoints = Checkpoints.to_write(tmp_path / "checkpoints", 2)
-    for expected in ("no checkpoint was written", "its checkpoint at 7 is good"):
+    for expected in ("no checkpoint was written", "its checkpoint at 7 is kept"):
         said = rf"cannot write here \(full\); {expected}"
         with pytest.raises(UserError, match=said), disks_explained([checkpoints]):
             raise OSError(errno.ENOSPC, "full", "here")

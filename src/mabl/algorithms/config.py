@@ -1,11 +1,11 @@
 """The configuration of a run, composed of what each package owns. Steps are joint steps."""
 
+import reprlib
 import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from math import inf
-from reprlib import repr as brief
 from typing import Any, ClassVar, Literal, TypeVar
 
 from mabl.behaviour.mappo import MAPPOConfig
@@ -145,6 +145,14 @@ def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:
     return cls(
         **{name: _value(hints[name], value, f"{path}{name}") for name, value in data.items()}
     )
+
+
+def brief(value: Any) -> str:
+    """What came, in a few words."""
+    try:
+        return reprlib.repr(value)
+    except ValueError:  # a number of thousands of digits
+        return "too large a number"
 
 
 def _value(hint: Any, value: Any, path: str) -> Any:

@@ -59,7 +59,7 @@ def hosted_of(make: Callable[[], HostEnv], draw: Callable[[], HostEnv] | None = 
 
 
 def load_factory(name: str, target: str, default: str) -> Callable[..., Any]:
-    """What is at `module:attribute`; modules in the current folder are found, too.
+    """What is at `module:attribute`; for names of one's own, modules in the current folder, too.
 
     Raises UserError for what cannot be imported.
     """
@@ -67,7 +67,7 @@ def load_factory(name: str, target: str, default: str) -> Callable[..., Any]:
     attribute = attribute or default
     if not module:
         raise UserError(f"{name} names no module: give module:factory")
-    if os.getcwd() not in sys.path:
+    if ":" in name and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:
         found: Any = importlib.import_module(module)

@@ -12,8 +12,7 @@ from importlib.util import find_spec, module_from_spec
 from multiprocessing import current_process
 from typing import Any, NamedTuple
 
-import yaml
-
+from mabl import plain_yaml
 from mabl.envs.base import CompiledEnv
 from mabl.envs.host import Hosted, made
 from mabl.errors import UserError, unknown_name
@@ -202,8 +201,8 @@ def parse_kwargs(kwargs: Sequence[str]) -> dict[str, Any]:
         if not (equals and key.isidentifier()):
             raise UserError(f"--env-kwargs {text!r}: give KEY=VALUE, e.g. max_cycles=25")
         try:
-            parsed[key] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+            parsed[key] = plain_yaml.load(value)
+        except ValueError as error:
             raise UserError(f"--env-kwargs {text!r}: {value!r} is not YAML") from error
     return parsed
 

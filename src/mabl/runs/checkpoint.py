@@ -4,16 +4,18 @@ checkpoints/step_N/policy.safetensors   what acting needs: filter and actor
                    state.safetensors    everything
                    checksums.json       size and SHA-256 of both
 
-Arrays are stored under readable names. Reading one runs no code, follows no links, and takes no
-more memory than the files have bytes.
+Arrays are stored under readable names. Reading one runs no code, and takes no more memory than the
+arrays that are wanted.
 """
 
 import hashlib
 import json
+import math
 import os
 import re
 import shutil
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,6 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from mabl.errors import UserError
+from mabl.runs.files import flush_folder, flush_to_disk
 
 T = TypeVar("T")
 
@@ -31,6 +34,8 @@ ITEMS = ("policy", "state")
 CHECKSUMS = "checksums.json"
 CHECKSUMS_SIZE = 4096
 """Bytes of it, at most."""
+HEADER_SIZE = 4_000_000
+"""Bytes for names and shapes in a file of arrays, at most."""
 PREFIX = "step_"
 UNFINISHED = "unfinished_"
 """Of a checkpoint's folder while it is written."""
@@ -70,7 +75,12 @@ class Checkpoints:
         return self.folder / f"{PREFIX}{step}"
 
     def save(self, step: int, policy: Any, state: Any) -> None:
-        """Write one checkpoint, then let go of the oldest. Raises OSError, and leaves no trace."""
+        """Write one checkpoint, then let go of the oldest. Raises OSError, and leaves no trace.
+
+        One that is there already is of the same run at the same step, and stays.
+        """
+        if step in self.steps:
+            return
         unfinished = self.folder / f"{UNFINISHED}{step}"
         try:
             unfinished.mkdir()
@@ -80,29 +90,31 @@ class Checkpoints:
                 write(path, to_arrays(tree))
                 written[path.name] = fingerprint(path)
             (unfinished / CHECKSUMS).write_text(json.dumps(written))
-            for path in (*unfinished.iterdir(), unfinished):
-                flush_to_disk(path)
-            shutil.rmtree(self.at(step), ignore_errors=True)  # of a run that was resumed before it
+            for path in unfinished.iterdir():
+                with path.open("rb") as file:
+                    flush_to_disk(file.fileno())
+            flush_folder(unfinished)
             unfinished.rename(self.at(step))
         except BaseException:
             shutil.rmtree(unfinished, ignore_errors=True)
             raise
-        flush_to_disk(self.folder)
+        flush_folder(self.folder)
         for old in self.steps[self._keep :]:
             shutil.rmtree(self.at(old))
 
     def restore(self, item: str, like: T) -> tuple[int, T]:
         """An item of the newest checkpoint that is whole, structured like `like`, and its step.
 
-        `like` has arrays or their shapes. Warns of damaged checkpoints. Raises UserError if none is
-        whole, or if that one has other arrays than `like`.
+        `like` has arrays or their shapes. For `policy`, its own file decides, for `state` all do.
+        Warns of damaged checkpoints. Raises UserError if none is whole, or if that one has other
+        arrays than `like`.
         """
+        wanted = jax.eval_shape(to_arrays, like)
         for step in self.steps:
             try:
-                check_whole(self.at(step))
-                path = self.at(step) / f"{item}.safetensors"
-                arrays = read(path, jax.eval_shape(to_arrays, like))
-            except Damaged as damage:
+                check_whole(self.at(step), ITEMS[: ITEMS.index(item) + 1], tree_bytes(wanted))
+                arrays = read(self.at(step) / f"{item}.safetensors", wanted)
+            except (Damaged, OSError) as damage:
                 warnings.warn(f"{damage}: an older checkpoint is needed", stacklevel=2)
             else:
                 return step, from_arrays(like, arrays)
@@ -115,25 +127,31 @@ class Checkpoints:
                 shutil.rmtree(self.at(later))
 
 
-def check_whole(checkpoint: Path) -> None:
-    """Raises Damaged unless every file of a checkpoint is as it was written."""
-    files = [checkpoint / f"{item}.safetensors" for item in ITEMS]
+def check_whole(checkpoint: Path, items: Sequence[str], size: int) -> None:
+    """Raises Damaged unless these files of a checkpoint are as they were written.
+
+    Raises UserError, and does not read it, if one has more bytes than arrays of `size` bytes take.
+    """
     checksums = checkpoint / CHECKSUMS
-    if checkpoint.is_symlink():
-        raise Damaged(f"{checkpoint} is a link")
-    for path in (checksums, *files):
-        if path.is_symlink() or not path.is_file():
-            raise Damaged(f"{path} is missing or a link")
     try:
         with checksums.open("rb") as file:
             written = json.loads(file.read(CHECKSUMS_SIZE))
-    except (ValueError, RecursionError) as error:
-        raise Damaged(f"{checksums} is damaged") from error
-    if not isinstance(written, dict) or written.keys() != {path.name for path in files}:
+    except (OSError, ValueError, RecursionError) as error:
+        raise Damaged(f"{checksums} is missing or damaged") from error
+    if not isinstance(written, dict) or len(written) != len(ITEMS):
         raise Damaged(f"{checksums} is damaged")
-    for path in files:
-        if fingerprint(path) != written[path.name]:
+    for path in (checkpoint / f"{item}.safetensors" for item in items):
+        if not path.is_file():
+            raise Damaged(f"{path} is missing")
+        if path.stat().st_size > size + HEADER_SIZE:
+            raise misfit(path, f"{path.stat().st_size} bytes")
+        if fingerprint(path) != written.get(path.name):
             raise Damaged(f"{path} is damaged, or its checksum in {CHECKSUMS} is")
+
+
+def tree_bytes(tree: Any) -> int:
+    """Bytes of all arrays of a pytree (or of their shapes)."""
+    return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def fingerprint(path: Path) -> dict[str, Any]:
@@ -163,7 +181,7 @@ def read(path: Path, wanted: dict[str, jax.ShapeDtypeStruct]) -> dict[str, np.nd
             if other := set(file.keys()) ^ set(wanted):
                 raise misfit(path, min(other))
             arrays = {name: file.get_tensor(name) for name in wanted}
-    except SafetensorError as error:
+    except (SafetensorError, AttributeError, TypeError) as error:  # the latter: numpy lacks a type
         raise Damaged(f"{path} is damaged ({error})") from error
     for name, array in arrays.items():
         if (array.shape, array.dtype) != (wanted[name].shape, wanted[name].dtype):
@@ -176,15 +194,6 @@ def misfit(path: Path, name: str) -> UserError:
     return UserError(
         f"{path} does not fit this run's config ({name}): use it with the mabl that wrote it"
     )
-
-
-def flush_to_disk(path: Path) -> None:
-    """Have a file or folder outlive a loss of power."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def to_arrays(tree: Any) -> dict[str, jax.Array]:

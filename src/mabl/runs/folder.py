@@ -1,7 +1,6 @@
 """A run's folder: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP with config, versions, metrics, checkpoints.
 
-config.yaml      every field of the configuration that the algorithm reads
-config.signature where the environment is code: that this user's mabl wrote it
+config.yaml      every field of the configuration that the algorithm reads, signed by this user
 versions.yaml    package versions, git commit, machine
 metrics.jsonl    one JSON object a line, `step` in environment steps
 curves.png       refreshed during training
@@ -21,11 +20,13 @@ from pathlib import Path
 
 import yaml
 
+from mabl import plain_yaml
 from mabl.algorithms.config import Config, from_dict
 from mabl.algorithms.registry import unread
 from mabl.envs.registry import names_code
 from mabl.errors import UserError
-from mabl.runs.trust import is_own, sign
+from mabl.runs.files import check_plain, replace_file
+from mabl.runs.trust import is_own, signed
 
 CONFIG_SIZE = 1_000_000
 """Characters of a config, at most."""
@@ -46,7 +47,7 @@ def create(config: Config, seed: int) -> Path:
         parent.mkdir(parents=True, exist_ok=True)
         folder = make_unused(parent, stamp)
         write_config(folder, config)
-        write_yaml(folder / "versions.yaml", versions())
+        replace_file(folder / "versions.yaml", as_yaml(versions()))
     except OSError as error:
         raise UserError(
             f"cannot write to {parent} ({error.strerror}): choose another --logdir"
@@ -69,44 +70,43 @@ def make_unused(parent: Path, stamp: str) -> Path:
 def read_config(folder: Path, trust: bool = False) -> Config:
     """The configuration of a run.
 
-    Raises UserError if the folder is not a run, and unless `trust`, if it names code of this
-    machine to be run, and this user's mabl did not write it.
+    Raises UserError if the folder is not a run, or holds links; and unless `trust`, if this user's
+    mabl did not write it, and it names code or arguments of an environment.
     """
     path = folder / "config.yaml"
     if not path.is_file():
         raise UserError(f"{folder} is not a run folder (no config.yaml): give one of mabl train's")
+    check_plain(folder)
     try:
         with path.open(encoding="utf-8") as file:
-            data = yaml.safe_load(file.read(CONFIG_SIZE))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+            text = file.read(CONFIG_SIZE)
+        data = plain_yaml.load(text)
+    except ValueError as error:
         raise UserError(f"{path} is not readable YAML: restore it or train again") from error
     try:
         config = from_dict(Config, data)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    if names_code(config.env) and not trust and not is_own(folder):
+    if (names_code(config.env) or config.env_kwargs) and not trust and not is_own(text):
+        with_what = f" with {' '.join(config.env_kwargs)}" if config.env_kwargs else ""
         raise UserError(
-            f"{folder} was not written by your mabl, and its environment {config.env} is code that "
-            "would be run: look at its config.yaml, then add --trust"
+            f"{folder} was not written by your mabl, and would have {config.env} made{with_what}: "
+            "look at its config.yaml, then add --trust"
         )
     return config
 
 
 def write_config(folder: Path, config: Config) -> None:
-    """Record a changed configuration, e.g. more steps after a resume."""
+    """Record a changed configuration, e.g. more steps after a resume. It is signed."""
     data = dataclasses.asdict(config)
     for name in unread(config.algo):
         del data[name]
-    write_yaml(folder / "config.yaml", data)
-    if names_code(config.env):
-        sign(folder)
+    replace_file(folder / "config.yaml", signed(as_yaml(data)))
 
 
-def write_yaml(path: Path, data: dict) -> None:
-    """Plain YAML in the given order; the file is replaced whole."""
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(yaml.safe_dump(data, sort_keys=False))
-    temporary.replace(path)
+def as_yaml(data: dict) -> str:
+    """Plain YAML in the given order."""
+    return yaml.safe_dump(data, sort_keys=False)
 
 
 def versions() -> dict[str, str]:

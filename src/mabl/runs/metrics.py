@@ -13,6 +13,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[re
 from tensorboardX.summary import scalar
 
 from mabl.errors import UserError
+from mabl.runs.files import flush_to_disk, replace_file
 
 Row = dict[str, float]
 
@@ -25,9 +26,7 @@ class MetricsLog:
         self._path = folder / "metrics.jsonl"
         if resume_at is not None:
             kept = [row for row in read(folder) if row["step"] <= resume_at]
-            temporary = self._path.with_suffix(".tmp")
-            temporary.write_text("".join(map(_line, kept)))
-            temporary.replace(self._path)
+            replace_file(self._path, "".join(map(_line, kept)))
         self._file = self._path.open("a")
         self._tensorboard = TensorBoard(folder / "tensorboard", resume_at)
 
@@ -37,6 +36,10 @@ class MetricsLog:
         self._file.write(_line({"step": step, **finite}))
         self._file.flush()
         self._tensorboard.write(step, finite)
+
+    def flush_to_disk(self) -> None:
+        """Have all rows so far outlive a loss of power."""
+        flush_to_disk(self._file.fileno())
 
     def close(self) -> None:
         """Flush and release the files."""

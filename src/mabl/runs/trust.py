@@ -1,38 +1,36 @@
 """Which run folders may name code. One that this user's mabl wrote may; a stranger's may not.
 
 An environment of one's own is named `adapter:module:factory`, in `config.yaml` too: whoever loads
-the run imports the module and calls the factory. So what mabl writes there is signed with a key of
-the user's, and what is not signed so must be trusted explicitly.
+the run imports the module and calls the factory. So mabl signs what it writes there, in its last
+line, with a key of the user's; what is not signed so must be trusted explicitly.
 """
 
 import hmac
 import os
 import secrets
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 
-SIGNATURE = "config.signature"
+MARK = "# signed "
 
 
-def sign(folder: Path) -> None:
-    """Say that this user's mabl wrote the config of a run folder. Without a home, it cannot."""
+def signed(text: str) -> str:
+    """A config with the user's signature; as it is where the user has no place for a key."""
     key = user_key(create=True)
-    if key:
-        (folder / SIGNATURE).write_text(signature(folder, key))
+    return f"{text}{MARK}{signature(text, key)}\n" if key else text
 
 
-def is_own(folder: Path) -> bool:
-    """Whether this user's mabl wrote the config as it is."""
-    key, file = user_key(), folder / SIGNATURE
-    if key is None or not file.is_file() or file.is_symlink():
-        return False
-    with file.open("rb") as opened:
-        return hmac.compare_digest(opened.read(100), signature(folder, key).encode())
+def is_own(text: str) -> bool:
+    """Whether this user's mabl wrote that config as it is."""
+    body, _, given = text.rpartition(MARK)
+    key = user_key()
+    return key is not None and hmac.compare_digest(f"{signature(body, key)}\n", given)
 
 
-def signature(folder: Path, key: bytes) -> str:
-    """Of the config's bytes."""
-    return hmac.new(key, (folder / "config.yaml").read_bytes(), sha256).hexdigest()
+def signature(text: str, key: bytes) -> str:
+    """Of a text, by a key."""
+    return hmac.new(key, text.encode(), sha256).hexdigest()
 
 
 def user_key(create: bool = False) -> bytes | None:
@@ -42,10 +40,12 @@ def user_key(create: bool = False) -> bytes | None:
         path = home / "mabl" / "key"
         if create and not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            with os.fdopen(
-                os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb"
-            ) as file:
-                file.write(secrets.token_bytes(32))
+            draft = path.with_name(f"key-{secrets.token_hex(8)}")
+            draft.touch(0o600)
+            draft.write_bytes(secrets.token_bytes(32))
+            with suppress(FileExistsError):  # another process was first
+                os.link(draft, path)
+            draft.unlink()
         return path.read_bytes() or None
     except (OSError, RuntimeError):
         return None

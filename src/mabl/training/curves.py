@@ -62,7 +62,7 @@ def smoothed(rows: list[Row], name: str) -> tuple[list[float], list[float]]:
     window: deque[Row] = deque()
     episodes = total = 0.0
     for row in rows:
-        if name not in row:
+        if name not in row or not row.get("train/episodes", 0) > 0:
             continue
         window.append(row)
         episodes += row["train/episodes"]

@@ -86,4 +86,4 @@ def disks_explained(checkpoints: Sequence[Checkpoints]) -> Iterator[None]:
 def kept(checkpoints: Checkpoints) -> str:
     """What there is to go back to."""
     newest: Any = next(iter(checkpoints.steps), None)
-    return "no checkpoint was written" if newest is None else f"its checkpoint at {newest} is good"
+    return "no checkpoint was written" if newest is None else f"its checkpoint at {newest} is kept"

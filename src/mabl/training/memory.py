@@ -1,17 +1,10 @@
 """How much memory there is, and how much a run takes."""
 
-import math
 from pathlib import Path
-from typing import Any
 
 import jax
 
 from mabl.errors import UserError
-
-
-def tree_bytes(tree: Any) -> int:
-    """Bytes of all arrays of a pytree (or of their shapes)."""
-    return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def free_memory() -> int | None:

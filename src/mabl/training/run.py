@@ -3,6 +3,8 @@
 import signal
 import threading
 import time
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -18,13 +20,13 @@ from mabl.devices import SEEDS
 from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
 from mabl.runs import folder
-from mabl.runs.checkpoint import Checkpoints
+from mabl.runs.checkpoint import Checkpoints, tree_bytes
 from mabl.runs.lock import writing
 from mabl.runs.metrics import MetricsLog, Row, read
 from mabl.training import curves
 from mabl.training.faults import check_finite, disks_explained
 from mabl.training.loop import Training, TrainState
-from mabl.training.memory import check_memory, free_memory, tree_bytes
+from mabl.training.memory import check_memory, free_memory
 from mabl.training.programs import grid_of, programs
 from mabl.training.progress import Progress, duration
 
@@ -166,15 +168,15 @@ def _run(
                     progress.update({"step": step, **row})
             if crossed(saved, step, config.training.checkpoint_every):
                 saved = step
-                save(training, states, checkpoints)
+                save(training, states, checkpoints, logs)
             if time.monotonic() - drawn > CURVES_EVERY:
                 drawn = time.monotonic()
                 draw_curves(folders, config)
-        save(training, states, checkpoints)
+        save(training, states, checkpoints, logs)
         draw_curves(folders, config)
         for log in logs:
             log.close()
-    stopped_by = interruption.received
+    stopped_by = interruption.received if step < total_steps else None
     console.print(
         f"{'interrupted' if stopped_by else 'finished'} at {step:,} steps after "
         f"{duration(time.monotonic() - began)}",
@@ -220,8 +222,15 @@ def describe(metrics: Row, spec: EnvSpec) -> Row:
     return row
 
 
-def save(training: Training, states: TrainState, checkpoints: list[Checkpoints]) -> None:
-    """Checkpoint every seed in its own folder."""
+def save(
+    training: Training,
+    states: TrainState,
+    checkpoints: list[Checkpoints],
+    logs: Sequence[MetricsLog] = (),
+) -> None:
+    """Checkpoint every seed in its own folder, its metrics being on the disk."""
+    for log in logs:
+        log.flush_to_disk()
     for k, manager in enumerate(checkpoints):
         state = jax.tree.map(lambda x, k=k: x[k], states)
         policy = training.algorithm.policy(state.learner)
@@ -254,7 +263,8 @@ class _Interruption:
         del frame
         self.received = signal.Signals(number)
         again = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
-        self._console.print(f"stopping after this cycle; {again} again stops at once")
+        with suppress(OSError):  # a terminal that is gone
+            self._console.print(f"stopping after this cycle; {again} again stops at once")
         self._restore()
 
     def _restore(self) -> None:
