@@ -357,7 +357,9 @@ def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fres
         updated(1.0, real),
         updated(0.0, real),
     )
-    assert same(plain.actor, taught.actor)
+    other, _ = updated(1.0, real._replace(target=-real.target))
+    assert same(other.actor, taught.actor) and not same(other.critic, taught.critic)
+    as_good_as_same(plain.actor, taught.actor)
     as_good_as_same(plain.critic, deaf.critic)
     assert (value(taught) > value(plain)).all()
     assert metrics["behaviour/replay_critic_loss"] > 10  # 0.5 (9 - about 0)^2, falling
