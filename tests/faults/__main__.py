@@ -116,7 +116,8 @@ def tests(name: str, cases: int, *paths: str) -> Result:
     failed = counts.get("failed", 0) + counts.get("error", 0)
     if failed:
         console.print(done.stdout)
-    drawn = [int(n) for n in re.findall(r"(\d+) passing examples", done.stdout)]
+    reports = done.stdout.split("Hypothesis Statistics")[-1].split("\ntests/")[1:]
+    drawn = [sum(map(int, re.findall(r"(\d+) passing", report))) for report in reports]
     injected = sum(counts.values()) - len(drawn) + sum(drawn)
     seconds = time.monotonic() - began
     return Result(name, injected, injected - failed, failed, seconds, {"pytest": last})

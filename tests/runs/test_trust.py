@@ -16,7 +16,8 @@ from mabl.runs.folder import read_config, write_config
 
 FORBIDDEN = (
     r"pickle|marshal|shelve|joblib|torch\.load|allow_pickle|jsonpickle"
-    r"|(?<!\w)yaml\.load\((?!text, PlainLoader)|yaml\.unsafe|\beval\(|\bexec\(|os\.system|shell=True"
+    r"|(?<!\w)yaml\.load\((?!text, PlainLoader)|yaml\.unsafe"
+    r"|\beval\(|\bexec\(|os\.system|shell=True"
 )
 ATTACK = "pettingzoo:os:mkdir"
 
