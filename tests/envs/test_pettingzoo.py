@@ -144,6 +144,8 @@ def test_continuous_actions_fill_their_own_bounds():
         (f"{OWN}:Odd", ("which=mixed",), "mixes discrete and continuous actions"),
         (f"{OWN}:Leaving", ("stay",), "--env-kwargs 'stay': give KEY=VALUE"),
         (f"{OWN}:Leaving", ("colour=red",), "cannot be made with colour=red"),
+        ("pettingzoo:os:system", (), "cannot be made with no arguments .*'command'"),
+        ("pettingzoo:os:sep", (), "sep of os is no factory: give module:factory"),
         ("petting:x", (), "unknown environment 'petting:x'.*pettingzoo:module:factory"),
     ],
 )

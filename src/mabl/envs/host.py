@@ -4,7 +4,9 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from inspect import signature
 from math import isfinite
 from typing import Any, Protocol
 
@@ -79,18 +81,29 @@ def load_factory(name: str, target: str, default: str) -> Callable[..., Any]:
         if not hasattr(found, part):
             raise UserError(f"{name}: {module} has no {attribute}: give module:factory")
         found = getattr(found, part)
+    if not callable(found):
+        raise UserError(f"{name}: {attribute} of {module} is no factory: give module:factory")
     return found
 
 
 def made(name: str, factory: Callable[..., Any], kwargs: Mapping[str, Any]) -> Any:
-    """What a factory makes. Raises UserError for arguments that it does not take."""
+    """What a factory makes. Raises UserError for arguments that it does not take, or lacks."""
+    try:
+        with suppress(ValueError):  # what is built in may not say what it takes
+            signature(factory).bind(**kwargs)
+    except TypeError as error:
+        raise _cannot_be_made(name, kwargs, error) from error
     try:
         return factory(**kwargs)
     except TypeError as error:
         if not kwargs:
             raise
-        given = " ".join(f"{key}={value}" for key, value in kwargs.items())
-        raise UserError(f"{name} cannot be made with {given}: {error}") from error
+        raise _cannot_be_made(name, kwargs, error) from error
+
+
+def _cannot_be_made(name: str, kwargs: Mapping[str, Any], error: TypeError) -> UserError:
+    given = " ".join(f"{key}={value}" for key, value in kwargs.items()) or "no arguments"
+    return UserError(f"{name} cannot be made with {given} ({error}): give --env-kwargs KEY=VALUE")
 
 
 def empty_rows(spec: EnvSpec, *leading: int) -> TimeStep:
