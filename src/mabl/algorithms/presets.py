@@ -211,7 +211,7 @@ _MAMBA_PAPER = {
 # Talking is slower to learn than listening to oneself. With less entropy two of three agents may
 # agree early, and the third never.
 _MAMBA_TEST = {
-    "total_steps": 12_000,
+    "total_steps": 15_000,
     "training": {"model_updates": 20},
     "world_model": {"learning_rate": 1e-3},
     "communication": {"n_layers": 1},
@@ -255,7 +255,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
             "epsilon_updates": 40,
         },
     },
-    ("quick", "test", "mamba"): _MAMBA_TEST,
+    ("quick", "test", "mamba"): _MAMBA_TEST | {"mappo": {"ent_coef": 0.5}},
     ("quick", "test", "mag"): _MAMBA_TEST
     | {"lookahead": {"candidates": 2, "steps": 2, "hidden": 64, "n_hidden": 2}},
     ("quick", "test", "mappo"): {
