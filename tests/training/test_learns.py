@@ -14,6 +14,10 @@ from mabl.training.run import updates_due
 
 LAST_EPISODES, FIRST_EPISODES = 300, 200
 
+SEEDS = {"mamba": 3}
+"""Seeds of which one must learn, where not the first must: when agents that talk agree early, the
+last of them may be left behind, and rounding (the number of threads, say) decides on which seed."""
+
 
 @pytest.fixture
 def compile_well():
@@ -49,11 +53,9 @@ def alone(algo: str):
 
 @pytest.mark.parametrize("algo", map(alone, ALGORITHMS))
 def test_it_learns_to_remember_and_to_coordinate(algo, compile_well):
-    """On one of three seeds: where agents agree early, the last of them may be left behind, and
-    which seed that happens to depends on rounding, on the number of threads, say."""
     config = preset("quick", "test/coordination", algo)
     programs = programs_of(config)
-    for seed in range(3):
+    for seed in range(SEEDS.get(algo, 1)):
         _, _, scores, counts = learned(config, compile_well, seed, programs)
         first, last = first_and_last(scores, counts)
         assert first < 0.3  # it is learned, not given
