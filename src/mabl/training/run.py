@@ -33,6 +33,9 @@ from mabl.training.progress import Progress, duration
 CURVES_EVERY = 30.0
 """Seconds between refreshes of curves.png."""
 
+SUMS = ("episodes/", "rows/")
+"""What a cycle tells of itself, and no row of metrics repeats."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -212,7 +215,7 @@ def crossed(before: int, now: int, every: int) -> bool:
 
 def describe(metrics: Row, spec: EnvSpec) -> Row:
     """Sums over a cycle's episodes as means under the field's names."""
-    row = {name: value for name, value in metrics.items() if not name.startswith("episodes/")}
+    row = {name: value for name, value in metrics.items() if not name.startswith(SUMS)}
     episodes = metrics["episodes/count"]
     row["train/episodes"] = episodes
     if episodes:
