@@ -122,8 +122,8 @@ def parse_with_config(
 class ResumeArguments:
     """Continue a run from its newest checkpoint."""
 
-    run: tyro.conf.Positional[Path]
-    """Run folder, as printed by `mabl train`."""
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folder, as printed by `mabl train`; several seeds of one program go on in one."""
     total_steps: int | None = None
     """New number of environment steps; default: as configured."""
     num_devices: int | None = None
@@ -135,10 +135,13 @@ class ResumeArguments:
 def resume(arguments: list[str]) -> int:
     """Continue a run from its newest checkpoint."""
     given = parse(ResumeArguments, arguments, "mabl resume")
+    if not given.runs:
+        raise UserError("mabl resume needs a run folder: give one of mabl train's")
     from mabl.training.run import resume as resume_run
 
     use_compilation_cache()
-    return EXIT_CODES[resume_run(**shallow(given)).stopped_by]
+    outcome = resume_run(given.runs, given.total_steps, given.num_devices, given.trust)
+    return EXIT_CODES[outcome.stopped_by]
 
 
 @dataclass(frozen=True)

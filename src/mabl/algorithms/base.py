@@ -39,6 +39,11 @@ class Algorithm(Protocol):
         """Rows of a lane of the replay from which an update can learn."""
         ...
 
+    @property
+    def imagined_steps(self) -> int:
+        """Joint steps that are imagined in a policy update, and learned from."""
+        ...
+
     def init(self, key: PRNGKey) -> Any:
         """A fresh learner."""
         ...

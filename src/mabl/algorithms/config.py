@@ -1,5 +1,6 @@
 """The configuration of a run, composed of what each package owns. Steps are joint steps."""
 
+import re
 import reprlib
 import types
 import typing
@@ -90,6 +91,8 @@ class Config:
     """Arguments that it is made with: KEY=VALUE, values in YAML."""
     algo: str = "mabl"
     """Algorithm: `mabl algos` lists them."""
+    label: str = ""
+    """What run folders and reports call it; default: the algorithm's name."""
     preset: Literal["quick", "paper"] = "quick"
     """Hyperparameters to start from: `quick` (a 2-core CPU) or `paper` (Tables 2 to 4)."""
     total_steps: int = 100_000
@@ -101,7 +104,7 @@ class Config:
     num_devices: int = 1
     """Accelerators to use: seeds are spread over them, and batches where there are fewer seeds."""
     logdir: str = "runs"
-    """Where run folders go: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP."""
+    """Where run folders go: LOGDIR/ENV/ALGO/seed_N/TIMESTAMP, or with its label for ALGO."""
     workers: Literal["processes", "ray"] = "processes"
     """Where environments that run in Python do so: on this machine, or in a Ray cluster."""
     num_workers: int | None = None
@@ -119,6 +122,11 @@ class Config:
     qmix: QMIXConfig = field(default_factory=QMIXConfig)
     recurrent_mappo: RecurrentMAPPOConfig = field(default_factory=RecurrentMAPPOConfig)
 
+    @property
+    def name(self) -> str:
+        """What run folders and reports call the algorithm with these settings."""
+        return self.label or self.algo
+
     @classmethod
     def sections(cls) -> list[str]:
         """Names of the fields that are configurations themselves."""
@@ -128,6 +136,10 @@ class Config:
         require_positive(self, "total_steps", "num_seeds", "num_devices", "worker_timeout")
         require_between(self, 0, inf, "num_workers")
         require_between(self, 0, 2**32 - self.num_seeds, "seed")
+        if not re.fullmatch(r"[\w.+-]{0,60}", self.label) or self.label.startswith("."):
+            raise UserError(
+                f"--label is {brief(self.label)}: give at most 60 letters, digits, and - _ + ."
+            )
 
 
 def from_dict(cls: type[T], data: Mapping[str, Any], path: str = "") -> T:

@@ -52,6 +52,11 @@ class MAG(NamedTuple):
         """A sequence of the model's."""
         return self.base.rows_needed
 
+    @property
+    def imagined_steps(self) -> int:
+        """Those learned from; candidates and lookahead are not counted."""
+        return self.base.imagined_steps
+
     def init(self, key: PRNGKey) -> LookaheadLearner:
         """Fresh parameters and optimisers."""
         config = self.config.lookahead

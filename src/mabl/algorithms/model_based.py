@@ -50,6 +50,13 @@ class ModelBased(NamedTuple):
         """A sequence of the model's."""
         return self.config.world_model.batch_length
 
+    @property
+    def imagined_steps(self) -> int:
+        """Of the trajectories from all start states."""
+        sizes, plan = self.config.world_model, self.config.imagination
+        rows = sizes.batch_size * sizes.batch_length
+        return min(rows, plan.n_starts or rows) * (plan.horizon - 1)
+
     def init(self, key: PRNGKey) -> Learner:
         """Fresh parameters and optimisers."""
         key_model, key_behaviour = jax.random.split(key)

@@ -79,6 +79,11 @@ class ModelFree:
         """Whatever a cycle collects."""
         return 1
 
+    @property
+    def imagined_steps(self) -> int:
+        """None: there is no model."""
+        return 0
+
     def init(self, key: PRNGKey) -> PolicyLearner:
         """Fresh parameters and optimisers."""
         config, spec = self.config.recurrent_mappo, self.spec

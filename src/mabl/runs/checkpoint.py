@@ -103,28 +103,42 @@ class Checkpoints:
             shutil.rmtree(self.at(old))
 
     def restore(self, item: str, like: T) -> tuple[int, T]:
-        """An item of the newest checkpoint that is whole, structured like `like`, and its step.
-
-        `like` has arrays or their shapes. For `policy`, its own file decides, for `state` all do.
-        Warns of damaged checkpoints. Raises UserError if none is whole, or if that one has other
-        arrays than `like`.
-        """
-        wanted = jax.eval_shape(to_arrays, like)
-        for step in self.steps:
-            try:
-                check_whole(self.at(step), ITEMS[: ITEMS.index(item) + 1], tree_bytes(wanted))
-                arrays = read(self.at(step) / f"{item}.safetensors", wanted)
-            except (Damaged, OSError) as damage:
-                warnings.warn(f"{damage}: an older checkpoint is needed", stacklevel=2)
-            else:
-                return step, from_arrays(like, arrays)
-        raise UserError(f"{self.folder.parent} has no whole checkpoint: train it again")
+        """An item of the newest checkpoint that is whole, and its step; see `restore`."""
+        step, (tree,) = restore([self], item, like)
+        return step, tree
 
     def forget_after(self, step: int) -> None:
         """Remove damaged checkpoints past `step`: the run will produce them again."""
         for later in self.steps:
             if later > step:
                 shutil.rmtree(self.at(later))
+
+
+def restore(runs: Sequence[Checkpoints], item: str, like: T) -> tuple[int, list[T]]:
+    """An item of the newest checkpoint that is whole in each run, and its step.
+
+    `like` has arrays or their shapes, as one run's. For `policy`, its own file decides, for `state`
+    all do. Warns of damaged checkpoints. Raises UserError if none is whole, or if that one has
+    other arrays than `like`.
+    """
+    wanted = jax.eval_shape(to_arrays, like)
+    items = ITEMS[: ITEMS.index(item) + 1]
+
+    def read_one(checkpoint: Path) -> T:
+        check_whole(checkpoint, items, tree_bytes(wanted))
+        return from_arrays(like, read(checkpoint / f"{item}.safetensors", wanted))
+
+    for step in shared_steps(runs):
+        try:
+            return step, [read_one(run.at(step)) for run in runs]
+        except (Damaged, OSError) as damage:
+            warnings.warn(f"{damage}: an older checkpoint is needed", stacklevel=2)
+    raise UserError(f"{runs[0].folder.parent} has no whole checkpoint: train it again")
+
+
+def shared_steps(runs: Sequence[Checkpoints]) -> list[int]:
+    """Environment steps of checkpoints that all of these runs have, newest first."""
+    return [step for step in runs[0].steps if all(step in run.steps for run in runs[1:])]
 
 
 def check_whole(checkpoint: Path, items: Sequence[str], size: int) -> None:

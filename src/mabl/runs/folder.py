@@ -41,7 +41,7 @@ def create(config: Config, seed: int) -> Path:
     """
     devices = config.num_devices // gcd(config.num_devices, config.num_seeds)  # of one seed
     config = replace(config, seed=seed, num_seeds=1, num_devices=devices)
-    parent = Path(config.logdir) / config.env / config.algo / f"seed_{seed}"
+    parent = Path(config.logdir) / config.env / config.name / f"seed_{seed}"
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:
         parent.mkdir(parents=True, exist_ok=True)

@@ -37,7 +37,7 @@ class Programs(NamedTuple):
 
 
 _UNCOMPILED = (
-    *("preset", "seed", "total_steps", "logdir"),
+    *("label", "preset", "seed", "total_steps", "logdir"),
     *("workers", "num_workers", "worker_timeout"),
 )
 """Fields of a config that no program depends on."""

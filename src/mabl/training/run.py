@@ -20,7 +20,7 @@ from mabl.devices import SEEDS
 from mabl.envs.base import EnvSpec
 from mabl.errors import UserError
 from mabl.runs import folder
-from mabl.runs.checkpoint import Checkpoints, tree_bytes
+from mabl.runs.checkpoint import Checkpoints, restore, shared_steps, tree_bytes
 from mabl.runs.lock import writing
 from mabl.runs.metrics import MetricsLog, Row, read
 from mabl.training import curves
@@ -60,7 +60,7 @@ def train(config: Config, console: Console | None = None) -> Outcome:
 
 
 def resume(
-    run: Path | str,
+    run: Path | str | Sequence[Path | str],
     total_steps: int | None = None,
     num_devices: int | None = None,
     trust: bool = False,
@@ -68,32 +68,48 @@ def resume(
 ) -> Outcome:
     """Continue one run from its newest whole checkpoint, as configured or as told.
 
-    Where there is none yet, it begins. With `trust`, the run may name code of this machine as its
-    environment, whoever wrote it.
+    Several that were trained in one program go on in one, from the newest that all of them have.
+    Where there is none yet, they begin. With `trust`, a run may name code of this machine as its
+    environment, whoever wrote it. Raises UserError for a user's mistake.
     """
     console = console or Console(stderr=True)
-    path = Path(run)
-    config = folder.read_config(path, trust)
+    folders = [Path(run)] if isinstance(run, str | Path) else [Path(one) for one in run]
     told = {"total_steps": total_steps, "num_devices": num_devices}
-    config = replace(config, **{name: new for name, new in told.items() if new is not None})
+    told = {name: new for name, new in told.items() if new is not None}
+    configs = [replace(folder.read_config(path, trust), **told) for path in folders]
+    check_alike(folders, configs)
+    config = replace(configs[0], num_seeds=len(folders))
     shape = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), check_memory_of(config, console)
     )
-    with writing([path]):
-        checkpoints = checkpoints_of(path, config)
-        if checkpoints.steps:
-            step, state = checkpoints.restore("state", shape)
-            states = jax.tree.map(lambda x: x[None], state)
-            checkpoints.forget_after(step)
+    with writing(folders):
+        checkpoints = [checkpoints_of(path, config) for path in folders]
+        if shared_steps(checkpoints):
+            step, restored = restore(checkpoints, "state", shape)
+            states = jax.tree.map(lambda *x: jnp.stack(x), *restored)
         else:
-            step, states = 0, programs(config).init(jax.random.key(config.seed)[None])
+            step, keys = -1, jnp.stack([jax.random.key(config.seed) for config in configs])
+            states = programs(config).init(keys)
         if step >= config.total_steps:
             raise UserError(
-                f"{path} has already done {step} of {config.total_steps} steps: "
+                f"{folders[0]} has already done {step} of {config.total_steps} steps: "
                 "give a larger --total-steps"
             )
-        folder.write_config(path, config)
-        return _run(config, states, [path], console, resumed=True)
+        for path, own, kept in zip(folders, configs, checkpoints, strict=True):
+            kept.forget_after(step)
+            folder.write_config(path, own)
+        return _run(config, states, folders, console, resumed=True)
+
+
+def check_alike(folders: Sequence[Path], configs: Sequence[Config]) -> None:
+    """Raise UserError unless runs differ in their seeds alone."""
+    for path, config in zip(folders[1:], configs[1:], strict=True):
+        if replace(config, seed=configs[0].seed) != configs[0]:
+            raise UserError(
+                f"{path} has another config than {folders[0]}: resume it on its own"
+            )
+    if len({config.seed for config in configs}) < len(configs):
+        raise UserError("two of the runs have the same seed: resume them one by one")
 
 
 def checkpoints_of(path: Path, config: Config) -> Checkpoints:
@@ -133,7 +149,11 @@ def _run(
     states = run.place(states)
     checkpoints = [checkpoints_of(path, config) for path in folders]
     step = int(states.env_steps.min())
-    logs = [MetricsLog(path, resume_at=step if resumed else None) for path in folders]
+    own_steps = jax.device_get(states.env_steps).tolist()
+    logs = [
+        MetricsLog(path, resume_at=own if resumed else None)
+        for path, own in zip(folders, own_steps, strict=True)
+    ]
     warned = False
     saved, drawn, began = step, time.monotonic(), time.monotonic()
     console.print("compiling (cached for the next run) ...", highlight=False)
@@ -164,6 +184,7 @@ def _run(
                 row = describe(
                     {name: float(v[k]) for name, v in metrics.items()}, training.env.spec
                 )
+                row["train/imagined_steps"] = n_policy * training.algorithm.imagined_steps
                 row["time/seconds"] = seconds
                 row["time/steps_per_second"] = (step - before) / seconds
                 log.write(int(states.env_steps[k]), row)
@@ -231,19 +252,23 @@ def save(
     checkpoints: list[Checkpoints],
     logs: Sequence[MetricsLog] = (),
 ) -> None:
-    """Checkpoint every seed in its own folder, its metrics being on the disk."""
+    """Checkpoint every seed in its own folder, its metrics being on the disk.
+
+    Checkpoints are named by the steps that all seeds have done, so that all can go on from one.
+    """
     for log in logs:
         log.flush_to_disk()
+    step = int(states.env_steps.min())
     for k, manager in enumerate(checkpoints):
         state = jax.tree.map(lambda x, k=k: x[k], states)
         policy = training.algorithm.policy(state.learner)
-        manager.save(int(state.env_steps), policy, state)
+        manager.save(step, policy, state)
 
 
 def draw_curves(folders: list[Path], config: Config) -> None:
     """Refresh curves.png of every seed."""
     for path in folders:
-        curves.draw(read(path), f"{config.algo} on {config.env}", path / "curves.png")
+        curves.draw(read(path), f"{config.name} on {config.env}", path / "curves.png")
 
 
 class _Interruption:
