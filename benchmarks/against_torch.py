@@ -26,7 +26,7 @@ import torch
 from benchmarks.torch_reference import Learner, Sizes, WorldModel
 from mabl.algorithms.base import Experience
 from mabl.algorithms.presets import preset
-from mabl.cli import use_compilation_cache
+from mabl.devices import use_compilation_cache
 from mabl.nets.mlp import Linear
 from mabl.replay import Replay, sample_sequences
 from mabl.rows import TimeStep

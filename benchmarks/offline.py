@@ -21,7 +21,7 @@ import yaml
 from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config, from_dict
 from mabl.algorithms.model_based import Learner, ModelBased
-from mabl.cli import use_compilation_cache
+from mabl.devices import use_compilation_cache
 from mabl.evaluation import evaluate, summary
 from mabl.execution import executor_of
 from mabl.replay import Replay

@@ -3,9 +3,11 @@
 Programs are written as for one device; XLA cuts them up by where their arrays are said to lie.
 """
 
+import os
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from math import gcd
+from pathlib import Path
 from typing import TypeVar
 
 import jax
@@ -54,3 +56,10 @@ def spread(rows: Tree) -> Tree:
         return rows
     share = PartitionSpec(BATCH)
     return jax.tree.map(lambda x: jax.lax.with_sharding_constraint(x, share), rows)
+
+
+def use_compilation_cache() -> None:
+    """Keep compiled programs in the user's cache folder, unless JAX was told of another place."""
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(cache / "mabl" / "jax"))

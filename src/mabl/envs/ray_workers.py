@@ -12,8 +12,10 @@ from mabl.errors import UserError
 from mabl.rows import TimeStep
 
 
-def join_cluster() -> int:
-    """Join the cluster at `RAY_ADDRESS`, or one that runs here, or start one; its cores.
+def join_cluster(address: str | None = None) -> int:
+    """Join the cluster at an address, at `RAY_ADDRESS`, or one that runs here, or start one.
+
+    Returns its cores. `auto` is a cluster that is there already.
 
     Raises UserError without the extra, and if there is no such cluster.
     """
@@ -22,15 +24,15 @@ def join_cluster() -> int:
     try:
         import ray
     except ImportError as error:
-        raise UserError("Ray workers need an extra: pip install 'mabl[ray]'") from error
+        raise UserError("Ray needs an extra: pip install 'mabl[ray]'") from error
     if not ray.is_initialized():
         try:
-            ray.init(log_to_driver=False, logging_level=logging.WARNING)
+            ray.init(address, log_to_driver=False, logging_level=logging.WARNING)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            where = os.environ.get("RAY_ADDRESS", "this machine")
+            where = address or os.environ.get("RAY_ADDRESS", "this machine")
             raise UserError(
-                f"no Ray cluster at {where} ({error}): start it, give RAY_ADDRESS as HOST:PORT, or "
-                "unset it to use this machine"
+                f"no Ray cluster at {where} ({error}): start it, give its address as HOST:PORT, or "
+                "none to use this machine"
             ) from error
     return max(1, int(ray.cluster_resources().get("CPU", 1)))
 

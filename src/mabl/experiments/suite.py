@@ -120,7 +120,7 @@ def read(path: Path) -> Suite:
     except ValueError as error:
         raise UserError(f"{path} is not readable YAML ({error})") from error
     if not isinstance(data, dict):
-        raise UserError(f"{path} is no suite: give tasks and algorithms, as docs/experiments.md has")
+        raise UserError(f"{path} is no suite: give tasks and algorithms (docs/experiments.md)")
     spelt = {"name": path.stem} | data
     for key, short in (("tasks", "env"), ("algorithms", "algo")):
         if isinstance(spelt.get(key), list):
@@ -133,6 +133,26 @@ def read(path: Path) -> Suite:
         raise UserError(f"{path}: {error}") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
+
+
+def narrowed(suite: Suite, tasks: Sequence[str], algorithms: Sequence[str]) -> Suite:
+    """A suite with only these of its tasks and algorithms, all where none is named.
+
+    Raises UserError for those that it does not have.
+    """
+    by_env = {task.env: task for task in suite.tasks}
+    by_name = {one.label or one.algo: one for one in suite.algorithms}
+    for kind, wanted, known in (("task", tasks, by_env), ("algorithm", algorithms, by_name)):
+        for name in wanted:
+            if name not in known:
+                raise unknown_name(f"{kind} of suite {suite.name}", name, known)
+    return replace(
+        suite,
+        tasks=tuple(task for task in suite.tasks if not tasks or task.env in tasks),
+        algorithms=tuple(
+            one for name, one in by_name.items() if not algorithms or name in algorithms
+        ),
+    )
 
 
 def changed(config: Config, changes: Changes) -> Config:

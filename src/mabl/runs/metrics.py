@@ -17,6 +17,9 @@ from mabl.runs.files import flush_to_disk, replace_file
 
 Row = dict[str, float]
 
+NOT_SCORES = ("episodes", "episode_return", "episode_length", "skipped_updates", "imagined_steps")
+"""What rows say under `train/` beside the environment's score."""
+
 
 class MetricsLog:
     """Appends rows to `metrics.jsonl` and TensorBoard; one line is one write."""
@@ -97,6 +100,12 @@ def column(rows: Iterable[Row], name: str) -> tuple[list[float], list[float]]:
     """Steps and values of one metric, where it was logged."""
     pairs = [(row["step"], row[name]) for row in rows if name in row]
     return [step for step, _ in pairs], [value for _, value in pairs]
+
+
+def score_name(rows: Iterable[Row]) -> str | None:
+    """What the environment calls its score; None where no episode has ended."""
+    named = (name.removeprefix("train/") for row in rows for name in row if "train/" in name)
+    return next((name for name in named if name not in NOT_SCORES), None)
 
 
 def _line(row: Mapping[str, float]) -> str:

@@ -1,0 +1,126 @@
+"""Commands of many runs: suite, and job, which is one process of a suite."""
+
+import signal
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from mabl.cli.shared import EXIT_CODES, print_table
+from mabl.errors import UserError
+from mabl.parsing import parse
+
+
+@dataclass(frozen=True)
+class SuiteArguments:
+    """Run a suite: its algorithms on its tasks, with all its seeds. What is done is kept."""
+
+    suite: tyro.conf.Positional[str]
+    """A name of `mabl suite list`, or a file of your own: suite.yaml."""
+    backend: Literal["local", "ray"] = "local"
+    """Where jobs run: on this machine's cores, or on a Ray cluster."""
+    address: str | None = None
+    """The Ray cluster: HOST:PORT, or auto; default: RAY_ADDRESS, or this machine."""
+    logdir: Path = Path("runs")
+    """Run folders go to LOGDIR/SUITE."""
+    num_seeds: int | None = None
+    """Seeds of each algorithm on each task; default: the suite's."""
+    total_steps: int | None = None
+    """Environment steps of every run; default: the suite's."""
+    tasks: tuple[str, ...] = ()
+    """Only these environments of the suite."""
+    algorithms: tuple[str, ...] = ()
+    """Only these algorithms of the suite, by name or label."""
+    cpus: float | None = None
+    """Cores of one job; default: the suite's."""
+    gpus: float | None = None
+    """GPUs of one job, with Ray; a fraction lets jobs share one; default: the suite's."""
+    parallel: int | None = None
+    """Jobs at once on this machine; default: as many as it has cores for."""
+    retry: bool = False
+    """Try again what failed before."""
+
+
+def suite(arguments: list[str]) -> int:
+    """Compare algorithms on tasks: suite run SUITE, suite list."""
+    if arguments[:1] == ["list"]:
+        parse(lambda: None, arguments[1:], "mabl suite list", description="List suites.")
+        return list_suites()
+    if arguments[:1] != ["run"]:
+        if arguments[:1] in (["-h"], ["--help"]):
+            print("usage: mabl suite run SUITE [--help]\n       mabl suite list")
+            return 0
+        raise UserError("mabl suite needs a verb: give mabl suite run SUITE, or mabl suite list")
+    given = parse(SuiteArguments, arguments[1:], "mabl suite run")
+    from mabl.experiments.jobs import jobs_of
+    from mabl.experiments.running import run_jobs
+    from mabl.experiments.suite import load, narrowed
+
+    chosen = narrowed(load(given.suite), given.tasks, given.algorithms)
+    told = {"seeds": given.num_seeds, "cpus": given.cpus, "gpus": given.gpus}
+    chosen = replace(chosen, **{name: new for name, new in told.items() if new is not None})
+    logdir = given.logdir / chosen.name
+    jobs = jobs_of(chosen, logdir, given.total_steps)
+    console = Console(stderr=True)
+    tally = run_jobs(jobs, backend_of(given, chosen.cpus), console, given.retry)
+    console.print(tally.says(), highlight=False)
+    console.print(f"next: mabl report {logdir}", highlight=False, soft_wrap=True)
+    if tally.stopped_by:
+        return EXIT_CODES[tally.stopped_by]
+    return int(bool(tally.failed or tally.broken))
+
+
+def backend_of(given: SuiteArguments, cpus: float):
+    """Where jobs are to run. Raises UserError if they cannot."""
+    if given.backend == "ray":
+        from mabl.experiments.cluster import RayBackend
+
+        return RayBackend(given.address)
+    if given.address:
+        raise UserError("--address is of a Ray cluster: add --backend ray")
+    from mabl.experiments.processes import LocalBackend
+
+    return LocalBackend(cpus, given.parallel)
+
+
+def list_suites() -> int:
+    """Those that come with mabl."""
+    from mabl.experiments.suite import shipped
+
+    table = Table(box=None, padding=(0, 1))
+    for heading in ("name", "tasks", "algorithms", "seeds", "preset", "description"):
+        table.add_column(heading, no_wrap=heading == "name")
+    for name, one in shipped().items():
+        algorithms = ", ".join(contender.label or contender.algo for contender in one.algorithms)
+        table.add_row(
+            name, str(len(one.tasks)), algorithms, str(one.seeds), one.preset, one.description
+        )
+    print_table(table)
+    return 0
+
+
+@dataclass(frozen=True)
+class JobArguments:
+    """Do what is left of one job of a suite."""
+
+    job: tyro.conf.Positional[Path]
+    """Its file: LOGDIR/jobs/NAME.yaml."""
+    attached: bool = False
+    """Save and end once standard input is closed."""
+
+
+def job(arguments: list[str]) -> int:
+    """Run one job of a suite, as its processes do."""
+    given = parse(JobArguments, arguments, "mabl job")
+    from mabl.devices import use_compilation_cache
+    from mabl.experiments.jobs import read_job
+    from mabl.experiments.worker import stop_with_parent, work
+
+    if given.attached:
+        stop_with_parent()
+    use_compilation_cache()
+    stopped_by: signal.Signals | None = work(read_job(given.job), Console(stderr=True))
+    return EXIT_CODES[stopped_by]
