@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mabl.cli.episodes import check_env, evaluate, play
-from mabl.cli.experiments import job, suite
+from mabl.cli.experiments import job, report, suite
 from mabl.cli.lists import list_algos, list_envs
 from mabl.cli.runs import bench, resume, train
 from mabl.cli.shared import INTERRUPTED
@@ -66,6 +66,7 @@ COMMANDS = {
     "eval": evaluate,
     "play": play,
     "suite": suite,
+    "report": report,
     "envs": list_envs,
     "check-env": check_env,
     "bench": bench,

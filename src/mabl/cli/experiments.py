@@ -1,5 +1,6 @@
-"""Commands of many runs: suite, and job, which is one process of a suite."""
+"""Commands of many runs: suite, its jobs, and reports on them."""
 
+import shlex
 import signal
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -124,3 +125,43 @@ def job(arguments: list[str]) -> int:
     use_compilation_cache()
     stopped_by: signal.Signals | None = work(read_job(given.job), Console(stderr=True))
     return EXIT_CODES[stopped_by]
+
+
+@dataclass(frozen=True)
+class ReportArguments:
+    """Compare finished runs: a page with curves, tables and statistics, that needs no network."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders with runs in them, such as those of mabl suite run."""
+    out: Path | None = None
+    """Where the report goes; default: a folder `report` in the first of them."""
+    title: str | None = None
+    """Its title; default: the folders' names."""
+
+
+def report(arguments: list[str]) -> int:
+    """Compare finished runs on one page."""
+    given = parse(ReportArguments, arguments, "mabl report")
+    if not given.runs:
+        raise UserError("mabl report needs folders with runs: give runs/quick, for one")
+    from mabl.experiments.report import write_report
+
+    console = Console(stderr=True)
+    title = given.title or " and ".join(path.resolve().name for path in given.runs)
+    with console.status("comparing"):
+        written = write_report(
+            given.runs,
+            given.out or given.runs[0] / "report",
+            title,
+            shlex.join(["mabl", "report", *arguments]),
+        )
+    for gap in written.comparison.missing:
+        console.print(
+            f"missing: {gap.algorithm} on {gap.task}, seed {gap.seed}: {gap.reason}",
+            highlight=False,
+            soft_wrap=True,
+        )
+    if written.without_marl_eval:
+        console.print(f"no marl_eval.json: {written.without_marl_eval}", highlight=False)
+    print(written.page)
+    return 0

@@ -50,9 +50,7 @@ class Tally:
         return ", ".join(f"{n} {what}" for what, n in counts.items() if n) or "nothing to do"
 
 
-def run_jobs(
-    jobs: Sequence[Job], backend: Backend, console: Console, retry: bool = False
-) -> Tally:
+def run_jobs(jobs: Sequence[Job], backend: Backend, console: Console, retry: bool = False) -> Tally:
     """Run what is not done, and show how far it is. Failed jobs are left alone unless `retry`."""
     tally = Tally()
     waiting: dict[str, Job] = {}

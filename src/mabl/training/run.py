@@ -105,9 +105,7 @@ def check_alike(folders: Sequence[Path], configs: Sequence[Config]) -> None:
     """Raise UserError unless runs differ in their seeds alone."""
     for path, config in zip(folders[1:], configs[1:], strict=True):
         if replace(config, seed=configs[0].seed) != configs[0]:
-            raise UserError(
-                f"{path} has another config than {folders[0]}: resume it on its own"
-            )
+            raise UserError(f"{path} has another config than {folders[0]}: resume it on its own")
     if len({config.seed for config in configs}) < len(configs):
         raise UserError("two of the runs have the same seed: resume them one by one")
 
