@@ -1,6 +1,6 @@
-.PHONY: check lint types layers test pins
+.PHONY: check lint types layers test browser pins
 
-check: lint types layers test
+check: lint types layers browser test
 
 lint:
 	uv run ruff check .
@@ -14,6 +14,13 @@ layers:
 
 test:
 	uv run pytest -n auto
+
+# Pages are tested in Chromium: where it is missing and may be installed, it is.
+browser:
+	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
+		&& apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -yq \
+		--no-install-recommends chromium fonts-dejavu-core; } \
+		|| echo "no chromium here: the tests of pages are skipped"
 
 # The versions to paste into [tool.uv] constraint-dependencies, after removing the old ones there.
 pins:

@@ -95,7 +95,7 @@ def list_suites() -> int:
     for heading in ("name", "tasks", "algorithms", "seeds", "preset", "description"):
         table.add_column(heading, no_wrap=heading == "name")
     for name, one in shipped().items():
-        algorithms = ", ".join(contender.label or contender.algo for contender in one.algorithms)
+        algorithms = ", ".join(contender.name for contender in one.algorithms)
         table.add_row(
             name, str(len(one.tasks)), algorithms, str(one.seeds), one.preset, one.description
         )

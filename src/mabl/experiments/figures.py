@@ -71,6 +71,7 @@ def paper_curves(comparison: Comparison, task: Task) -> Picture:
         task,
         band,
         "mean",
+        "mean",
         "Mean over seeds, shaded from the least to the greatest seed, as in the paper's figures",
     )
 
@@ -82,6 +83,7 @@ def interval_curves(comparison: Comparison, task: Task) -> Picture:
         task,
         lambda curves: estimate(iqm, curves.T),
         "iqm",
+        "IQM",
         "Interquartile mean over seeds, shaded over its 95% bootstrap interval",
     )
 
@@ -91,6 +93,7 @@ def _curves(
     task: Task,
     band: Callable[[NDArray[np.floating]], Estimate],
     kind: str,
+    short: str,
     what: str,
 ) -> Picture:
     figure, axes = _panel()
@@ -113,7 +116,7 @@ def _curves(
     _legend(axes)
     return Picture(
         f"curve_{kind}_{slug(task.name)}",
-        f"{task.name}: {words(task.score)}",
+        f"{task.name}: {words(task.score)}, {short}",
         f"{what}; exponential moving average over the training episodes.",
         figure,
         rows,
@@ -123,23 +126,18 @@ def _curves(
 def aggregates(comparison: Comparison) -> Picture:
     """IQM, median, mean and optimality gap over all runs on all tasks."""
     results = comparison.aggregates
-    figure = Figure((2 * WIDTH, 0.9 + 0.42 * len(comparison.everywhere)), layout="constrained")
+    figure = Figure((WIDTH, 2 * (0.7 + 0.3 * len(comparison.everywhere))), layout="constrained")
+    panels = figure.subplots(2, 2, sharey=True).ravel()
     rows: list[Row] = []
-    for axes, (statistic, by_algorithm) in zip(
-        figure.subplots(1, len(results), sharey=True), results.items(), strict=True
-    ):
+    for axes, (statistic, by_algorithm) in zip(panels, results.items(), strict=True):
         for k, (name, found) in enumerate(by_algorithm.items()):
-            low, high = (float(np.where(np.isnan(x), found.value, x)) for x in found[1:])
-            axes.barh(
-                k, high - low, left=low, height=0.55, color=_colour(comparison, name), alpha=0.45
-            )
-            axes.plot([found.value] * 2, [k - 0.27, k + 0.27], color="black", linewidth=1.8)
+            _interval(axes, k, found, _colour(comparison, name))
             rows.append({"statistic": statistic, "algorithm": name, **_numbers(found)})
         axes.set_title(statistic, fontsize=10)
         axes.set_yticks(range(len(by_algorithm)), list(by_algorithm))
         axes.locator_params(axis="x", nbins=4)
         axes.grid(axis="x", alpha=0.3)
-        axes.invert_yaxis() if axes is figure.axes[0] else None
+    panels[0].invert_yaxis()
     return Picture(
         "aggregates",
         "Over all tasks",
@@ -202,13 +200,10 @@ def profiles(comparison: Comparison) -> Picture:
 def improvements(comparison: Comparison) -> Picture:
     """How likely a run of one algorithm beats a run of another."""
     found = comparison.improvements
-    figure = Figure((1.5 * WIDTH, 0.9 + 0.36 * len(found)), layout="constrained")
+    figure = Figure((WIDTH, 0.9 + 0.32 * len(found)), layout="constrained")
     axes = figure.subplots()
     for k, (one, other) in enumerate(found):
-        at = found[one, other]
-        low, high = (float(np.where(np.isnan(x), at.value, x)) for x in at[1:])
-        axes.barh(k, high - low, left=low, height=0.5, color=_colour(comparison, one), alpha=0.45)
-        axes.plot([at.value] * 2, [k - 0.25, k + 0.25], color="black", linewidth=1.8)
+        _interval(axes, k, found[one, other], _colour(comparison, one))
     axes.axvline(0.5, color="#555", linestyle=":", linewidth=1)
     axes.set_yticks(range(len(found)), [f"{one} > {other}" for one, other in found])
     axes.set(xlim=(0, 1), xlabel="probability")
@@ -245,6 +240,13 @@ def _line(axes: Axes, comparison: Comparison, name: str, x: NDArray, y: Estimate
         markevery=(k * every // 4 % every, every), **style,
     )  # fmt: skip
     axes.fill_between(x, y.low, y.high, color=style["color"], alpha=0.15, linewidth=0)
+
+
+def _interval(axes: Axes, at: int, found: Estimate, colour: str) -> None:
+    """A bar for the interval, a line for the value."""
+    low, high = (float(np.where(np.isnan(x), found.value, x)) for x in found[1:])
+    axes.barh(at, high - low, left=low, height=0.55, color=colour, alpha=0.45)
+    axes.plot([found.value] * 2, [at - 0.27, at + 0.27], color="black", linewidth=1.8)
 
 
 def _legend(axes: Axes) -> None:

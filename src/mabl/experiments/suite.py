@@ -49,6 +49,11 @@ class Contender:
     """What it is called, where one algorithm is in a suite twice."""
     config: dict = field(default_factory=dict)
 
+    @property
+    def name(self) -> str:
+        """For people."""
+        return self.label or self.algo
+
 
 @dataclass(frozen=True)
 class Suite:
@@ -141,7 +146,7 @@ def narrowed(suite: Suite, tasks: Sequence[str], algorithms: Sequence[str]) -> S
     Raises UserError for those that it does not have.
     """
     by_env = {task.env: task for task in suite.tasks}
-    by_name = {one.label or one.algo: one for one in suite.algorithms}
+    by_name = {one.name: one for one in suite.algorithms}
     for kind, wanted, known in (("task", tasks, by_env), ("algorithm", algorithms, by_name)):
         for name in wanted:
             if name not in known:
@@ -150,7 +155,9 @@ def narrowed(suite: Suite, tasks: Sequence[str], algorithms: Sequence[str]) -> S
         suite,
         tasks=tuple(task for task in suite.tasks if not tasks or task.env in tasks),
         algorithms=tuple(
-            one for name, one in by_name.items() if not algorithms or name in algorithms
+            one
+            for one in suite.algorithms
+            if not algorithms or (one.label or one.algo) in algorithms
         ),
     )
 

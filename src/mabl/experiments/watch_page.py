@@ -1,0 +1,378 @@
+"""The page of `mabl watch`: a table of runs, their curves, films of their episodes. Needs NiceGUI.
+
+Whoever opens it has a `Page`, which reads the folders every few seconds; all share one `Studio`.
+"""
+
+import asyncio
+import math
+import os
+import sys
+from asyncio.subprocess import DEVNULL, PIPE, STDOUT, Process
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from nicegui import app, background_tasks, core, ui
+from nicegui import run as nicegui_run
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.responses import FileResponse, Response
+
+from mabl.experiments.watch import HOST, Line, Standing, Watch, film_at, films
+from mabl.training.curves import PANELS
+from mabl.training.progress import duration
+
+EVERY = 3.0
+"""Seconds between two looks at the folders."""
+
+DRAWN = 10
+"""Runs that are drawn at once, at most."""
+
+SHOWN = 6
+"""Films of a run that are shown, the newest."""
+
+COLOURS = (
+    *("#2878d0", "#c75d1a", "#16875f", "#a8559f", "#9a7400"),
+    *("#c2413f", "#0e8291", "#7a64c8", "#6f7d2b", "#7d7f85"),
+)
+"""Of runs; each has a contrast of 3:1 with a light page and with a dark one."""
+
+DASHES = ("solid", "dashed", "dotted")
+"""Of the metrics in one panel."""
+
+NICENESS = 10
+"""Films leave the processors to what is trained."""
+
+STATES = {"running": "primary", "finished": "positive", "failed": "negative"}
+"""Colours of their bars; what is stopped or damaged is grey."""
+
+COLUMNS = (
+    ("task", "task"),
+    ("algorithm", "algorithm"),
+    ("seed", "seed"),
+    ("state", "state"),
+    ("done", "steps"),
+    ("score", "score"),
+    ("episode_return", "return"),
+    ("speed", "steps/s"),
+    ("left", "time left"),
+    ("note", "note"),
+)
+"""Of the table: fields and headings."""
+
+WORDS = {"task", "algorithm", "state", "note"}
+"""Columns that are not numbers."""
+
+DIGITS = {"score": 2, "episode_return": 2, "speed": 0}
+"""Of columns with decimals."""
+
+BAR = """
+<q-td :props="props">
+  {{ props.row.steps }}
+  <q-linear-progress :value="props.value" :color="props.row.colour" aria-label="steps done" />
+</q-td>
+"""
+CHOOSE = '<q-checkbox v-model="props.selected" dense aria-label="draw" />'
+
+
+class Studio:
+    """Films episodes with `mabl play`, one at a time."""
+
+    def __init__(self) -> None:
+        self.filming: Path | None = None
+        self.failed: dict[Path, str] = {}
+        """What it last said of runs that it could not film."""
+        self._process: Process | None = None
+
+    async def film(self, run: Path) -> None:
+        """Film an episode of a run, unless something is being filmed."""
+        if self.filming:
+            return
+        self.filming = run
+        self.failed.pop(run, None)
+        try:
+            self._process = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "mabl", "play", str(run), "--episodes", "1"),
+                stdin=DEVNULL,
+                stdout=PIPE,
+                stderr=STDOUT,
+                env=os.environ | {"JAX_PLATFORMS": "cpu"},  # accelerators are for training
+            )
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
+            said, _ = await self._process.communicate()
+            if self._process.returncode:
+                lines = said.decode(errors="replace").strip().splitlines()
+                self.failed[run] = lines[-1] if lines else f"exit code {self._process.returncode}"
+        finally:
+            self.filming = self._process = None
+
+    def close(self) -> None:
+        """Leave a film that is being made."""
+        if self._process:
+            self._process.terminate()
+
+
+class Page:
+    """What one visitor sees."""
+
+    def __init__(self, logdir: Path, studio: Studio):
+        self._logdir, self._studio = logdir, studio
+        self._watch = Watch(logdir)
+        self._standings: list[Standing] = []
+        self._chosen: set[str] | None = None
+        """Folders of runs that the visitor chose; None: those of the newest task."""
+        self._on_show: tuple[Any, ...] = ()
+        self._reading = asyncio.Lock()
+        self._build()
+        ui.timer(EVERY, self._refresh)
+
+    def _build(self) -> None:
+        ui.colors(primary="#1f6bb3", positive="#17803d")  # white on them can be read
+        with ui.header().classes("items-baseline bg-slate-800"):
+            ui.label("mabl watch").classes("text-lg font-medium").props("role=heading aria-level=1")
+            ui.label(str(self._logdir)).classes("text-sm break-all")
+        with ui.column().classes("w-full"):
+            with ui.row().classes("w-full items-center justify-between"):
+                self._summary = ui.label("reading ...").props("aria-live=polite")
+                find = ui.input("find runs").props("dense clearable")
+            self._table = ui.table(
+                rows=[],
+                columns=[column(*names) for names in COLUMNS],
+                row_key="id",
+                selection="multiple",
+                pagination=10,
+            )
+            self._table.classes("w-full").props("dense flat bordered")
+            self._table.add_slot("body-cell-done", BAR)
+            self._table.add_slot("header-selection", CHOOSE)
+            self._table.add_slot("body-selection", CHOOSE)
+            self._table.on_select(self._choose)
+            find.bind_value_to(self._table, "filter", lambda text: text or "")
+            self._drawn = ui.label()
+            with ui.grid().classes("w-full grid-cols-1 md:grid-cols-2 xl:grid-cols-3 gap-4"):
+                self._charts = {panel: chart(panel) for panel in PANELS}
+            with ui.row().classes("w-full items-center"):
+                ui.label("Episodes").classes("text-lg").props("role=heading aria-level=2")
+                self._run = ui.select({}, label="of", on_change=self._show_films)
+                self._run.classes("min-w-48").props("dense")
+                self._button = ui.button("film an episode", on_click=self._film).props("no-caps")
+                self._spinner = ui.spinner(size="sm")
+                self._said = ui.label()
+            self._films = ui.row().classes("w-full gap-4")
+
+    async def _refresh(self) -> None:
+        """Look at the folders, and show what has changed."""
+        async with self._reading:
+            standings = await nicegui_run.io_bound(self._watch.standings)
+            if standings is None:  # the server ends
+                return
+            self._standings = standings
+            self._show_table()
+            drawn = self._to_draw()
+            curves = await nicegui_run.io_bound(self._watch.curves, [run.folder for run in drawn])
+            if curves is None:
+                return
+            self._show_charts(drawn, curves)
+            self._show_films()
+
+    async def _choose(self) -> None:
+        self._chosen = {row["id"] for row in self._table.selected}
+        await self._refresh()
+
+    def _selected(self) -> list[Standing]:
+        if self._chosen is None:
+            known = [run for run in self._standings if run.state not in ("failed", "damaged")]
+            return [run for run in known if run.task == known[0].task][:DRAWN]
+        return [run for run in self._standings if str(run.folder) in self._chosen]
+
+    def _to_draw(self) -> list[Standing]:
+        """In an order that stays as runs go on, so that their colours do."""
+        return sorted(self._selected()[:DRAWN], key=lambda run: run.folder)
+
+    def _show_table(self) -> None:
+        states = Counter(run.state for run in self._standings)
+        self._summary.text = (
+            ", ".join(f"{n} {state}" for state, n in states.items())
+            or "no runs here yet: they show up by themselves"
+        )
+        rows = [cells(run) for run in self._standings]
+        chosen = {str(run.folder) for run in self._selected()}
+        selected = [row for row in rows if row["id"] in chosen]
+        if rows != self._table.rows or selected != self._table.selected:
+            self._table.rows, self._table.selected = rows, selected
+
+    def _show_charts(
+        self, drawn: Sequence[Standing], curves: dict[Path, dict[str, list[Line]]]
+    ) -> None:
+        names = labels(drawn)
+        left_out = len(self._selected()) - len(drawn)
+        self._drawn.text = (
+            f"drawn: {len(drawn)} runs; {left_out} that are chosen too are not" if left_out else ""
+        )
+        for panel, (whole, element) in self._charts.items():
+            lines = [
+                series(f"{names[run.folder]} {line.metric}", line.points, colour, dash)
+                for run, colour in zip(drawn, COLOURS, strict=False)
+                for line, dash in zip(curves[run.folder].get(panel, []), DASHES, strict=False)
+            ]
+            whole.set_visibility(bool(lines))
+            if lines != element.options["series"]:
+                element.options["series"] = lines
+                element.update()
+
+    def _show_films(self) -> None:
+        """Of the run that is looked at, and how it stands with the one to come."""
+        drawn = self._to_draw()
+        names = {str(folder): name for folder, name in labels(drawn).items()}
+        if names != self._run.options:
+            value = self._run.value if self._run.value in names else next(iter(names), None)
+            self._run.set_options(names, value=value)
+        run, studio = Path(self._run.value) if self._run.value else None, self._studio
+        self._button.set_enabled(bool(run and not studio.filming))
+        self._spinner.set_visibility(bool(studio.filming))
+        self._said.text = (
+            f"filming {studio.filming.relative_to(self._logdir)} ..."
+            if studio.filming
+            else studio.failed.get(run, "")
+            if run
+            else ""
+        )
+        found = [(path, path.stat().st_mtime_ns) for path in films(run)[:SHOWN]] if run else []
+        if (run, found) == self._on_show:
+            return
+        self._on_show = run, found
+        self._films.clear()
+        with self._films:
+            for path, stamp in found:
+                with ui.column().classes("max-w-full gap-1"):
+                    where = f"/films/{quote(path.relative_to(self._logdir).as_posix())}?{stamp}"
+                    kind = ui.video if path.suffix == ".mp4" else ui.image
+                    kind(where).classes("w-96 max-w-full")
+                    ui.label(path.name).classes("text-sm")
+            if run and not found:
+                ui.label("no films of this run yet")
+
+    def _film(self) -> None:
+        background_tasks.create(self._studio.film(Path(self._run.value)))
+
+
+def column(field: str, heading: str) -> dict[str, Any]:
+    """A column of the table."""
+    shown = {"name": field, "field": field, "label": heading, "sortable": field != "left"}
+    if field in DIGITS:
+        shown[":format"] = f"value => value?.toFixed({DIGITS[field]}) ?? ''"
+    return shown | {"align": "left" if field in WORDS else "right"}
+
+
+def cells(run: Standing) -> dict[str, Any]:
+    """A run's row of the table; what is not known is empty."""
+    total = run.config.total_steps if run.config else 0
+    return {
+        "id": str(run.folder),
+        "task": run.task,
+        "algorithm": run.config.name if run.config else run.folder.parent.parent.name,
+        "seed": run.config.seed if run.config else None,
+        "state": run.state,
+        "done": min(run.step / total, 1.0) if total else 0.0,
+        "steps": f"{run.step:,} of {total:,}" if total else "",
+        "colour": STATES.get(run.state, "grey"),
+        "score": known(run.score),
+        "episode_return": known(run.episode_return),
+        "speed": known(run.speed),
+        "left": duration(run.seconds_left) if math.isfinite(run.seconds_left) else "",
+        "note": run.note,
+    }
+
+
+def known(value: float) -> float | None:
+    """None if it is not."""
+    return value if math.isfinite(value) else None
+
+
+def labels(runs: Sequence[Standing]) -> dict[Path, str]:
+    """Short names that tell runs apart."""
+    several = len({run.task for run in runs}) > 1
+    names = {
+        run.folder: " ".join(
+            (*((run.task,) if several else ()), run.config.name, f"seed {run.config.seed}")
+        )
+        if run.config
+        else run.folder.name
+        for run in runs
+    }
+    times = Counter(names.values())
+    return {
+        folder: f"{name} {folder.name}" if times[name] > 1 else name
+        for folder, name in names.items()
+    }
+
+
+def chart(panel: str) -> tuple[ui.column, ui.echart]:
+    """An empty chart, and it with its title. `currentColor` has its text follow a dark page."""
+    text = {"color": "currentColor"}
+    axis = {
+        "axisLabel": text | {"hideOverlap": True},
+        "splitLine": {"lineStyle": {"color": "#8884"}},
+    }
+    steps = {"name": "environment steps", "nameLocation": "middle", "nameGap": 26}
+    with ui.column().classes("min-w-0 gap-0") as whole:
+        ui.label(panel).classes("font-medium").props("role=heading aria-level=2")
+        element = ui.echart(
+            {
+                "animation": False,
+                "textStyle": text,
+                "grid": {"left": 48, "right": 16, "top": 16, "bottom": 80},
+                "legend": {"type": "scroll", "bottom": 0, "textStyle": text}
+                | {"pageTextStyle": text, "pageIconColor": "#888"},
+                "tooltip": {"trigger": "axis", "confine": True},
+                "xAxis": axis | steps | {"type": "value", "splitNumber": 4, "nameTextStyle": text},
+                "yAxis": axis | {"type": "value", "scale": True},
+                "series": [],
+            },
+            renderer="svg",
+        )
+        element.classes("w-full h-72").props(f'role=img aria-label="{panel}"')
+    return whole, element
+
+
+def series(name: str, points: list[tuple[float, float]], colour: str, dash: str) -> dict[str, Any]:
+    """A line of a chart; what is a single point is drawn as one."""
+    return {
+        "type": "line",
+        "name": name.replace("_", " "),
+        "data": [list(point) for point in points],
+        "showSymbol": len(points) == 1,
+        "itemStyle": {"color": colour},
+        "lineStyle": {"width": 1.5, "type": dash},
+    }
+
+
+def run(logdir: Path, port: int, show: bool) -> None:
+    """Serve the page of an absolute folder without links in its path, until Ctrl-C."""
+    studio = Studio()
+    app.on_shutdown(studio.close)
+    # Pages of elsewhere may have their own name lead here, or open a socket to here.
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=["localhost", HOST, "[::1]"])
+    core.sio.eio.cors_allowed_origins = None  # the page's own alone
+
+    @app.get("/films/{where:path}")
+    def film(where: str) -> Response:
+        path = film_at(logdir, where)
+        return FileResponse(path) if path else Response("no such film", 404)
+
+    print(f"mabl watch: http://{HOST}:{port} (Ctrl-C ends it)", flush=True)
+    with suppress(KeyboardInterrupt):
+        ui.run(
+            lambda: Page(logdir, studio) and None,
+            host=HOST,
+            port=port,
+            title="mabl watch",
+            favicon="📈",
+            dark=None,  # as the visitor's system is
+            language="en-US",
+            show=show,
+            reload=False,
+            show_welcome_message=False,
+        )
