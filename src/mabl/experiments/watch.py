@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -335,10 +336,6 @@ def serve(logdir: Path, port: int = 8642, show: bool = True) -> None:
         raise UserError(f"there is no folder {logdir}: give one that holds runs, or will")
     if not 0 < port < 65_536:
         raise UserError(f"--port is {port}: give a number from 1 to 65535")
-    try:
-        import nicegui  # noqa: F401
-    except ImportError as error:
-        raise UserError("mabl watch needs an extra: pip install 'mabl[watch]'") from error
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -347,6 +344,8 @@ def serve(logdir: Path, port: int = 8642, show: bool = True) -> None:
             raise UserError(
                 f"port {port} cannot be had ({error.strerror}): give another --port"
             ) from error
+    if not find_spec("nicegui"):
+        raise UserError("mabl watch needs an extra: pip install 'mabl[watch]'")
     from mabl.experiments import watch_page
 
     watch_page.run(logdir.resolve(), port, show)

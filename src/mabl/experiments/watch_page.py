@@ -27,6 +27,9 @@ from mabl.training.progress import duration
 EVERY = 3.0
 """Seconds between two looks at the folders."""
 
+RECONNECT = 60.0
+"""Seconds for which a page that fell silent is kept, with what was chosen on it."""
+
 DRAWN = 10
 """Runs that are drawn at once, at most."""
 
@@ -58,11 +61,12 @@ COLUMNS = (
     ("episode_return", "return"),
     ("speed", "steps/s"),
     ("left", "time left"),
+    ("begun", "begun"),
     ("note", "note"),
 )
 """Of the table: fields and headings."""
 
-WORDS = {"task", "algorithm", "state", "note"}
+WORDS = {"task", "algorithm", "state", "begun", "note"}
 """Columns that are not numbers."""
 
 DIGITS = {"score": 2, "episode_return": 2, "speed": 0}
@@ -74,7 +78,13 @@ BAR = """
   <q-linear-progress :value="props.value" :color="props.row.colour" aria-label="steps done" />
 </q-td>
 """
-CHOOSE = '<q-checkbox v-model="props.selected" dense aria-label="draw" />'
+CHOOSE_ALL = '<q-checkbox v-model="props.selected" dense aria-label="draw all" />'
+CHOOSE = """
+<div class="no-wrap row items-center gap-1">
+  <q-checkbox v-model="props.selected" dense :aria-label="`draw ${props.row.id}`" />
+  <q-icon name="show_chart" :style="{ color: props.row.ink }" />
+</div>
+"""
 
 
 class Studio:
@@ -100,7 +110,8 @@ class Studio:
                 stderr=STDOUT,
                 env=os.environ | {"JAX_PLATFORMS": "cpu"},  # accelerators are for training
             )
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
+            with suppress(ProcessLookupError):  # it has ended already
+                os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
             said, _ = await self._process.communicate()
             if self._process.returncode:
                 lines = said.decode(errors="replace").strip().splitlines()
@@ -111,7 +122,8 @@ class Studio:
     def close(self) -> None:
         """Leave a film that is being made."""
         if self._process:
-            self._process.terminate()
+            with suppress(ProcessLookupError):
+                self._process.terminate()
 
 
 class Page:
@@ -130,7 +142,7 @@ class Page:
 
     def _build(self) -> None:
         ui.colors(primary="#1f6bb3", positive="#17803d")  # white on them can be read
-        with ui.header().classes("items-baseline bg-slate-800"):
+        with ui.header(fixed=False).classes("items-baseline bg-slate-800"):
             ui.label("mabl watch").classes("text-lg font-medium").props("role=heading aria-level=1")
             ui.label(str(self._logdir)).classes("text-sm break-all")
         with ui.column().classes("w-full"):
@@ -146,7 +158,7 @@ class Page:
             )
             self._table.classes("w-full").props("dense flat bordered")
             self._table.add_slot("body-cell-done", BAR)
-            self._table.add_slot("header-selection", CHOOSE)
+            self._table.add_slot("header-selection", CHOOSE_ALL)
             self._table.add_slot("body-selection", CHOOSE)
             self._table.on_select(self._choose)
             find.bind_value_to(self._table, "filter", lambda text: text or "")
@@ -159,7 +171,7 @@ class Page:
                 self._run.classes("min-w-48").props("dense")
                 self._button = ui.button("film an episode", on_click=self._film).props("no-caps")
                 self._spinner = ui.spinner(size="sm")
-                self._said = ui.label()
+                self._said = ui.label().classes("min-w-0 break-all").props("aria-live=polite")
             self._films = ui.row().classes("w-full gap-4")
 
     async def _refresh(self) -> None:
@@ -197,7 +209,10 @@ class Page:
             ", ".join(f"{n} {state}" for state, n in states.items())
             or "no runs here yet: they show up by themselves"
         )
-        rows = [cells(run) for run in self._standings]
+        inks = dict(zip((run.folder for run in self._to_draw()), COLOURS, strict=False))
+        rows = [
+            cells(run) | {"ink": inks.get(run.folder, "transparent")} for run in self._standings
+        ]
         chosen = {str(run.folder) for run in self._selected()}
         selected = [row for row in rows if row["id"] in chosen]
         if rows != self._table.rows or selected != self._table.selected:
@@ -249,13 +264,15 @@ class Page:
                 with ui.column().classes("max-w-full gap-1"):
                     where = f"/films/{quote(path.relative_to(self._logdir).as_posix())}?{stamp}"
                     kind = ui.video if path.suffix == ".mp4" else ui.image
-                    kind(where).classes("w-96 max-w-full")
+                    kind(where).classes("w-96 max-w-full").props["alt"] = path.name
                     ui.label(path.name).classes("text-sm")
             if run and not found:
                 ui.label("no films of this run yet")
 
-    def _film(self) -> None:
+    async def _film(self) -> None:
         background_tasks.create(self._studio.film(Path(self._run.value)))
+        await asyncio.sleep(0)  # it begins
+        self._show_films()
 
 
 def column(field: str, heading: str) -> dict[str, Any]:
@@ -282,6 +299,7 @@ def cells(run: Standing) -> dict[str, Any]:
         "episode_return": known(run.episode_return),
         "speed": known(run.speed),
         "left": duration(run.seconds_left) if math.isfinite(run.seconds_left) else "",
+        "begun": run.folder.name if total and run.folder.parent.name.startswith("seed_") else "",
         "note": run.note,
     }
 
@@ -362,10 +380,13 @@ def run(logdir: Path, port: int, show: bool) -> None:
         path = film_at(logdir, where)
         return FileResponse(path) if path else Response("no such film", 404)
 
+    def page() -> None:
+        Page(logdir, studio)
+
     print(f"mabl watch: http://{HOST}:{port} (Ctrl-C ends it)", flush=True)
     with suppress(KeyboardInterrupt):
         ui.run(
-            lambda: Page(logdir, studio) and None,
+            page,
             host=HOST,
             port=port,
             title="mabl watch",
@@ -373,6 +394,7 @@ def run(logdir: Path, port: int, show: bool) -> None:
             dark=None,  # as the visitor's system is
             language="en-US",
             show=show,
+            reconnect_timeout=RECONNECT,
             reload=False,
             show_welcome_message=False,
         )

@@ -1,0 +1,109 @@
+"""Suites that run: whatever happens on the way, they end as if nothing had."""
+
+import json
+import signal
+
+import pytest
+from tests.experiments.tiny_suite import (
+    finish,
+    is_free,
+    rows_of,
+    runs_of,
+    said,
+    start,
+    wait_for,
+    write_suite,
+)
+
+from mabl import cli
+from mabl.experiments.jobs import read_job
+
+STEPS = 1_000
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory):
+    return write_suite(tmp_path_factory.mktemp("suite"), {"mappo": {}}, STEPS)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(suite, tmp_path_factory):
+    """Its log folder."""
+    logdir = tmp_path_factory.mktemp("runs") / "whole"
+    assert finish(suite, logdir) == 0
+    return logdir
+
+
+def test_every_seed_is_trained_and_evaluated(undisturbed):
+    for seed in (0, 1):
+        (run,) = runs_of(undisturbed, "mappo", seed)
+        played = json.loads((run / "evaluation.json").read_text())
+        assert played["step"] >= STEPS and played["greedy"] is True
+        assert [len(played[name]) for name in ("score", "episode_return")] == [4, 4]
+    assert "1 done" in said(undisturbed) and "next: mabl report" in said(undisturbed)
+
+
+def test_what_is_done_is_kept(undisturbed, suite):
+    before = [
+        run.stat().st_mtime_ns for seed in (0, 1) for run in runs_of(undisturbed, "mappo", seed)
+    ]
+    assert finish(suite, undisturbed) == 0
+    assert "1 done before" in said(undisturbed)
+    after = [
+        run.stat().st_mtime_ns for seed in (0, 1) for run in runs_of(undisturbed, "mappo", seed)
+    ]
+    assert before == after
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_a_suite_that_is_killed_goes_on_where_it_was(how, suite, undisturbed, tmp_path):
+    """Its jobs save and end, and the next run of the suite waits for that."""
+    logdir = tmp_path / "cut"
+    process = start(suite, logdir)
+
+    def is_going() -> bool:
+        runs = runs_of(logdir, "mappo", 0)
+        return bool(runs) and any((runs[0] / "checkpoints").glob("step_*"))
+
+    wait_for(is_going)
+    process.send_signal(how)
+    assert process.wait(100) == (75 if how == signal.SIGTERM else -how)
+    if how == signal.SIGTERM:
+        assert is_free(runs_of(logdir, "mappo", 0)[0]) and "1 to go on" in said(logdir)
+    assert finish(suite, logdir) == 0
+    for seed in (0, 1):
+        assert rows_of(logdir, "mappo", seed) == rows_of(undisturbed, "mappo", seed)
+
+
+def test_what_fails_is_shown_and_tried_again_when_asked(tmp_path, capsys):
+    """While all else is done."""
+    algorithms = {"mappo": {}, "mappo+wrong": {"model_updates": 3}}
+    suite = write_suite(tmp_path, algorithms, 100, seeds=1)
+    run = ["suite", "run", str(suite), f"--logdir={tmp_path}"]
+    reason = "mappo has no model and learns from all it does: give 0"
+    assert cli.run(run) == 1
+    said = capsys.readouterr().err
+    assert "1 done, 1 failed" in said and reason in said
+    assert cli.run(run) == 1
+    assert "1 done before, 1 failed" in capsys.readouterr().err
+    log = tmp_path / "tiny" / "jobs" / "test-coordination_mappo+wrong_seed-0.log"
+    tried = log.read_text().count(reason)
+    assert cli.run([*run, "--retry"]) == 1
+    assert (tried, log.read_text().count(reason)) == (1, 2)
+    assert cli.run(["report", str(tmp_path / "tiny")]) == 0
+    assert reason in (tmp_path / "tiny" / "report" / "index.html").read_text()
+
+
+def test_more_steps_and_seeds_go_on_from_what_is_there(suite, undisturbed):
+    more = (f"--total-steps={STEPS + 200}", "--num-seeds=3")
+    assert finish(suite, undisturbed, *more) == 0
+    for seed in (0, 1, 2):
+        assert rows_of(undisturbed, "mappo", seed)[-1]["step"] >= STEPS + 200
+        (run,) = runs_of(undisturbed, "mappo", seed)
+        assert json.loads((run / "evaluation.json").read_text())["step"] >= STEPS + 200
+
+
+def test_one_job_can_be_run_by_hand(undisturbed, mabl):
+    (file,) = (undisturbed / "tiny" / "jobs").glob("*seeds-0-1.yaml")
+    assert read_job(file).is_done()
+    assert mabl("job", file)[0] == 0
