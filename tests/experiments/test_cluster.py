@@ -67,11 +67,7 @@ def test_a_suite_survives_the_loss_of_a_node(cluster, suite, tmp_path):
     tally = run_jobs(jobs, backend, Console(stderr=True))
     assert backend.lost and len(tally.done) == 2
     assert not any(place_of(job).exists() for job in jobs)
-    resumed = [
-        job.log.read_text().count("finished at") + job.log.read_text().count("interrupted")
-        for job in jobs
-    ]
-    assert sorted(resumed) == [1, 2]
+    assert sorted(job.log.read_text().count("compiling") for job in jobs) == [1, 2]
     for name in ALGORITHMS:
         assert rows_of(logdir, name, 0) == rows_of(undisturbed, name, 0)
 
@@ -84,16 +80,6 @@ def test_what_no_node_has_room_for_is_refused(cluster, suite, tmp_path):
 
 
 def test_a_cluster_that_is_not_there_is_named(suite, mabl, tmp_path):
-    code, _, said = mabl(
-        *(
-            "suite",
-            "run",
-            suite,
-            "--backend",
-            "ray",
-            "--address",
-            "127.0.0.1:1",
-            f"--logdir={tmp_path}",
-        )
-    )
+    where = ("--backend=ray", "--address=127.0.0.1:1", f"--logdir={tmp_path}")
+    code, _, said = mabl("suite", "run", suite, *where)
     assert code == 2 and "no Ray cluster at 127.0.0.1:1" in said

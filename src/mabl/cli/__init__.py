@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mabl.cli.episodes import check_env, evaluate, play
-from mabl.cli.experiments import job, report, suite
+from mabl.cli.experiments import job, report, suite, sweep
 from mabl.cli.lists import list_algos, list_envs
 from mabl.cli.runs import bench, resume, train
 from mabl.cli.shared import INTERRUPTED
@@ -67,6 +67,7 @@ COMMANDS = {
     "play": play,
     "suite": suite,
     "report": report,
+    "sweep": sweep,
     "envs": list_envs,
     "check-env": check_env,
     "bench": bench,

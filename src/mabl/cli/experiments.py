@@ -1,15 +1,16 @@
-"""Commands of many runs: suite, its jobs, and reports on them."""
+"""Commands of many runs: suites and their jobs, reports on them, and searches."""
 
 import shlex
 import signal
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
+from mabl.cli.runs import chosen_preset, parse_with_config
 from mabl.cli.shared import EXIT_CODES, print_table
 from mabl.errors import UserError
 from mabl.parsing import parse
@@ -74,12 +75,12 @@ def suite(arguments: list[str]) -> int:
     return int(bool(tally.failed or tally.broken))
 
 
-def backend_of(given: SuiteArguments, cpus: float):
+def backend_of(given: Any, cpus: float) -> Any:
     """Where jobs are to run. Raises UserError if they cannot."""
     if given.backend == "ray":
         from mabl.experiments.cluster import RayBackend
 
-        return RayBackend(given.address)
+        return RayBackend(given.address, cpus)
     if given.address:
         raise UserError("--address is of a Ray cluster: add --backend ray")
     from mabl.experiments.processes import LocalBackend
@@ -165,3 +166,67 @@ def report(arguments: list[str]) -> int:
         console.print(f"no marl_eval.json: {written.without_marl_eval}", highlight=False)
     print(written.page)
     return 0
+
+
+def field(name: str, kind: Any, default: Any, words: str) -> tuple[str, Any, Any]:
+    """A field of a command's own beside a config."""
+    return name, Annotated[kind, tyro.conf.arg(help=words)], default
+
+
+SWEEP = (
+    field("space", tuple[str, ...], (), "What to search: FIELD=LOW..HIGH[:log], FIELD=A,B,C."),
+    field("trials", int, 20, "How many settings to try; more go on from those that were tried."),
+    field("name", str, "sweep", "Runs and the study go to LOGDIR/NAME."),
+    field("eval_episodes", int, 32, "Greedy episodes of each trained policy."),
+    field("storage", str | None, None, "A database for Optuna; default: SQLite in LOGDIR/NAME."),
+    field("backend", Literal["local", "ray"], "local", "This machine's cores, or a Ray cluster."),
+    field("address", str | None, None, "The Ray cluster: HOST:PORT, or auto."),
+    field("cpus", float, 1.0, "Cores of one trial."),
+    field("gpus", float, 0.0, "GPUs of one trial, with Ray; a fraction shares one."),
+    field("parallel", int | None, None, "Trials at once on this machine."),
+)
+"""What `mabl sweep` reads beside a config."""
+
+
+def sweep(arguments: list[str]) -> int:
+    """Search for settings that win more, with Optuna."""
+    default, rest = chosen_preset(arguments, "mabl sweep")
+    config, given = parse_with_config(rest, default, "mabl sweep", sweep.__doc__, *SWEEP)
+    for name in ("trials", "cpus", "eval_episodes"):
+        if getattr(given, name) <= 0:
+            flag = name.replace("_", "-")
+            raise UserError(f"--{flag} is {getattr(given, name)}: give a number above 0")
+    from mabl.experiments.sweep import Search, flags_of, run_search
+
+    search = Search(
+        replace(config, logdir=str(Path(config.logdir) / given.name), num_seeds=1),
+        space=given.space,
+        trials=given.trials,
+        seeds=config.num_seeds,
+        eval_episodes=given.eval_episodes,
+        cpus=given.cpus,
+        gpus=given.gpus,
+        storage=given.storage,
+    )
+    console = Console(stderr=True)
+    study, running = run_search(search, backend_of(given, given.cpus), console)
+    done = [trial for trial in study.get_trials() if trial.value is not None]
+    done.sort(key=lambda trial: -(trial.value or 0))
+    table = Table(box=None, padding=(0, 1))
+    for heading in ("trial", "score", *(done[0].params if done else ())):
+        table.add_column(heading)
+    for trial in done[:10]:
+        table.add_row(str(trial.number), f"{trial.value:.3f}", *map(shown, trial.params.values()))
+    print_table(table)
+    if done:
+        console.print(
+            f"best: mabl train {flags_of(config, done[0].params)}", highlight=False, soft_wrap=True
+        )
+    if running.tally.stopped_by:
+        return EXIT_CODES[running.tally.stopped_by]
+    return int(not done)
+
+
+def shown(value: Any) -> str:
+    """A setting, in few digits."""
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

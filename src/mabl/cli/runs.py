@@ -27,7 +27,7 @@ def train(arguments: list[str]) -> int:
     return EXIT_CODES[train_run(config).stopped_by]
 
 
-def chosen_preset(arguments: list[str]) -> tuple["Config", list[str]]:
+def chosen_preset(arguments: list[str], prog: str = "mabl train") -> tuple["Config", list[str]]:
     """The preset of an environment and an algorithm, and the flags that are left."""
     from mabl.algorithms.presets import preset
 
@@ -37,7 +37,7 @@ def chosen_preset(arguments: list[str]) -> tuple["Config", list[str]]:
     try:
         chosen, rest = base.parse_known_args(arguments)
     except ArgumentError as error:
-        raise UserError(f"{error}: mabl train --help lists them") from error
+        raise UserError(f"{error}: {prog} --help lists them") from error
     return preset(chosen.preset, chosen.env, chosen.algo), rest
 
 

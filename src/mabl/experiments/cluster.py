@@ -26,9 +26,9 @@ GRACE = 60.0
 class RayBackend:
     """Every job one task, with the cores and GPUs that it asks for."""
 
-    def __init__(self, address: str | None = None):
-        """Raises UserError without the extra, and if there is no such cluster."""
-        join_cluster(address)
+    def __init__(self, address: str | None = None, cpus: float = 1):
+        """`cpus` of one job. Raises UserError without the extra, or without such a cluster."""
+        self.slots = max(1, int(join_cluster(address) // cpus))
         import ray
 
         self._ray: Any = ray

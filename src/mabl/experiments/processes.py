@@ -17,6 +17,11 @@ from mabl.experiments.jobs import Job
 class Backend(Protocol):
     """Where jobs run."""
 
+    @property
+    def slots(self) -> int:
+        """How many jobs run at once, at most."""
+        ...
+
     def submit(self, job: Job) -> None:
         """Have a job run when there is room."""
         ...
@@ -78,7 +83,7 @@ class LocalBackend:
         available = getattr(os, "sched_getaffinity", lambda _: range(n_cores()))(0)
         self._free = sorted(available)
         self._each = max(1, int(cpus))
-        self._parallel = parallel or len(self._free) // self._each
+        self.slots = parallel or len(self._free) // self._each
 
     def submit(self, job: Job) -> None:
         """Have a job run when there is room."""
@@ -95,6 +100,8 @@ class LocalBackend:
         for name, process in list(self._processes.items()):
             if (code := process.poll()) is not None:
                 codes[name] = code
+                if process.stdin:
+                    process.stdin.close()
                 self._free = sorted([*self._free, *self._cores.pop(name)])
                 del self._processes[name]
         self._fill()
@@ -114,7 +121,7 @@ class LocalBackend:
             process.wait()
 
     def _fill(self) -> None:
-        while self._waiting and len(self._processes) < self._parallel:
+        while self._waiting and len(self._processes) < self.slots:
             job = self._waiting.popleft()
             # More jobs than cores share all of them.
             cores, self._free = self._free[: self._each], self._free[self._each :]

@@ -50,36 +50,81 @@ class Tally:
         return ", ".join(f"{n} {what}" for what, n in counts.items() if n) or "nothing to do"
 
 
-def run_jobs(jobs: Sequence[Job], backend: Backend, console: Console, retry: bool = False) -> Tally:
-    """Run what is not done, and show how far it is. Failed jobs are left alone unless `retry`."""
-    tally = Tally()
-    waiting: dict[str, Job] = {}
-    for job in jobs:
+class Running:
+    """Jobs on a backend while they run, and what became of them; a context.
+
+    Ctrl-C or SIGTERM has them save and end; again, it is real.
+    """
+
+    def __init__(self, backend: Backend, console: Console):
+        self.tally = Tally()
+        self.going: dict[str, Job] = {}
+        """Submitted and not ended, by name."""
+        self._jobs: list[Job] = []
+        self._backend = backend
+        self._board = Board(console, self._jobs, self.tally)
+        self._stop = _Stop(backend, console)
+
+    def __enter__(self) -> "Running":
+        self._stop.__enter__()
+        self._board.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.tally.broken += self.going.values()
+        self.tally.stopped_by = self._stop.received
+        self._board.update(set())
+        self._board.__exit__(*error)
+        self._stop.__exit__(*error)
+        self._backend.close()
+
+    def add(self, job: Job, retry: bool = False) -> None:
+        """Have a job run, unless it is done; or unless it failed before, and this is no `retry`.
+
+        Raises UserError where it cannot.
+        """
+        self._jobs.append(job)
         if retry:
             job.failed.unlink(missing_ok=True)
         if job.is_done():
-            tally.kept.append(job)
+            self.tally.kept.append(job)
         elif job.failed.exists():
-            tally.failed[job.name] = job.failed.read_text().strip()
+            self.tally.failed[job.name] = job.failed.read_text().strip()
         else:
-            waiting[job.name] = job
-    board = Board(console, jobs, tally)
-    try:
-        with _Stop(backend, console) as stop, board:
-            for job in waiting.values():
-                job.write()
-                backend.submit(job)
-            while waiting and not (stop.received and not backend.running()):
-                for name, code in backend.ended().items():
-                    conclude(waiting.pop(name), code, tally, stop.received)
-                board.update(backend.running())
-                time.sleep(POLL_EVERY)
-            tally.broken += waiting.values()
-            tally.stopped_by = stop.received
-            board.update(set())
-    finally:
-        backend.close()
-    return tally
+            job.write()
+            self.going[job.name] = job
+            self._backend.submit(job)
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether there is anything to wait for."""
+        stopped = self._stop.received and not self._backend.running()
+        return bool(self.going) and not stopped
+
+    @property
+    def stopping(self) -> bool:
+        """Whether nothing more should be begun."""
+        return self._stop.received is not None
+
+    def wait(self) -> list[Job]:
+        """Look what ended, and show how things stand; those that ended."""
+        time.sleep(POLL_EVERY)
+        ended = []
+        for name, code in self._backend.ended().items():
+            ended.append(self.going.pop(name))
+            conclude(ended[-1], code, self.tally, self._stop.received)
+        self._board.update(self._backend.running())
+        return ended
+
+
+def run_jobs(jobs: Sequence[Job], backend: Backend, console: Console, retry: bool = False) -> Tally:
+    """Run what is not done, and show how far it is. Failed jobs are left alone unless `retry`."""
+    with Running(backend, console) as running:
+        for job in jobs:
+            running.add(job, retry)
+        while running.goes_on:
+            running.wait()
+    return running.tally
 
 
 def conclude(job: Job, code: int, tally: Tally, stopped: Any) -> None:

@@ -111,7 +111,7 @@ class Studio:
                 env=os.environ | {"JAX_PLATFORMS": "cpu"},  # accelerators are for training
             )
             with suppress(ProcessLookupError):  # it has ended already
-                os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
+                os.setpriority(os.PRIO_PROCESS, self._process.pid, os.nice(0) + NICENESS)
             said, _ = await self._process.communicate()
             if self._process.returncode:
                 lines = said.decode(errors="replace").strip().splitlines()
@@ -224,7 +224,7 @@ class Page:
         names = labels(drawn)
         left_out = len(self._selected()) - len(drawn)
         self._drawn.text = (
-            f"drawn: {len(drawn)} runs; {left_out} that are chosen too are not" if left_out else ""
+            f"{len(drawn)} runs are drawn, and {left_out} more are chosen" if left_out else ""
         )
         for panel, (whole, element) in self._charts.items():
             lines = [
