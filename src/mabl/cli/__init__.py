@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mabl.cli.episodes import check_env, evaluate, play
-from mabl.cli.experiments import job, report, suite, sweep
+from mabl.cli.experiments import job, report, suite, sweep, watch
 from mabl.cli.lists import list_algos, list_envs
 from mabl.cli.runs import bench, resume, train
 from mabl.cli.shared import INTERRUPTED
@@ -68,6 +68,7 @@ COMMANDS = {
     "suite": suite,
     "report": report,
     "sweep": sweep,
+    "watch": watch,
     "envs": list_envs,
     "check-env": check_env,
     "bench": bench,

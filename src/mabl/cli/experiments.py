@@ -1,4 +1,4 @@
-"""Commands of many runs: suites and their jobs, reports on them, and searches."""
+"""Commands of many runs: suites and their jobs, reports, searches, and a page to watch them."""
 
 import shlex
 import signal
@@ -230,3 +230,24 @@ def sweep(arguments: list[str]) -> int:
 def shown(value: Any) -> str:
     """A setting, in few digits."""
     return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True)
+class WatchArguments:
+    """Show runs while they go on, on a page of this machine, until Ctrl-C."""
+
+    logdir: tyro.conf.Positional[Path] = Path("runs")
+    """A folder with runs in it; new ones show up by themselves."""
+    port: int = 8642
+    """Of the page, on this machine alone."""
+    show: bool = True
+    """Open it in a browser."""
+
+
+def watch(arguments: list[str]) -> int:
+    """Show runs live on a local page."""
+    given = parse(WatchArguments, arguments, "mabl watch")
+    from mabl.experiments.watch import serve
+
+    serve(given.logdir, given.port, given.show)
+    return 0
