@@ -154,7 +154,8 @@ def test_the_export_is_what_marl_eval_reads(report):
     assert set(data) == {"smax", "flatland"} and set(data["smax"]) == {"3m"}
     seed = data["smax"]["3m"]["mabl"]["seed_0"]
     assert [seed[f"step_{k}"]["step_count"] for k in (0, STEPS - 1)] == [2_000, 40_000]
-    assert seed["absolute_metrics"]["win_rate"] == [1.0, 1.0]
+    for name in ("win_rate", "score"):
+        assert seed["absolute_metrics"][name] == [1.0, 1.0]
 
 
 def test_points_of_the_export_are_means_since_the_one_before(tmp_path):

@@ -122,7 +122,8 @@ class Board:
                 bar = ProgressBar(total, min(step, total), width=20)
             elif state == "failed":
                 words = self._tally.failed[job.name]
-            seeds = f"{job.seeds[0]}-{job.seeds[-1]}" if len(job.seeds) > 1 else f"{job.seeds[0]}"
+            first, last = job.seeds[0], job.seeds[-1]
+            seeds = f"{first}-{last}" if last > first else f"{first}"
             table.add_row(job.config.env, job.config.name, seeds, state, bar, words)
         return table
 

@@ -229,17 +229,22 @@ def _panel() -> tuple[Figure, Axes]:
 
 def _line(axes: Axes, comparison: Comparison, name: str, x: NDArray, y: Estimate) -> None:
     k = comparison.algorithms.index(name)
-    first = next((g.records[0] for t in comparison.tasks for n, g in t.groups.items() if n == name))
+    first = next(g.records[0] for t in comparison.tasks for n, g in t.groups.items() if n == name)
     decentralised = ALGORITHMS[first.config.algo].decentralised
-    style = {"color": _colour(comparison, name), "linestyle": "-" if decentralised else "--"}
-    label = name if decentralised else f"{name} (centralised)"
+    colour = _colour(comparison, name)
     every = max(1, len(x) // 6)
-    marker = MARKERS[k % len(MARKERS)]
     axes.plot(
-        x, y.value, label=label, linewidth=1.6, marker=marker, markersize=4,
-        markevery=(k * every // 4 % every, every), **style,
-    )  # fmt: skip
-    axes.fill_between(x, y.low, y.high, color=style["color"], alpha=0.15, linewidth=0)
+        x,
+        y.value,
+        label=name if decentralised else f"{name} (centralised)",
+        color=colour,
+        linestyle="-" if decentralised else "--",
+        linewidth=1.6,
+        marker=MARKERS[k % len(MARKERS)],
+        markersize=4,
+        markevery=(k * every // 4 % every, every),  # lines that coincide show both
+    )
+    axes.fill_between(x, y.low, y.high, color=colour, alpha=0.15, linewidth=0)
 
 
 def _interval(axes: Axes, at: int, found: Estimate, colour: str) -> None:

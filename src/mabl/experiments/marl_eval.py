@@ -52,19 +52,22 @@ def evaluated(group: Group) -> bool:
 
 def run(task: Task, group: Group, k: int) -> dict[str, Any]:
     """One seed: its points, and its greedy episodes."""
-    record = group.records[k]
+    record, columns = group.records[k], {}
     ends = np.linspace(task.end / STEPS, task.end, STEPS)
-    columns = {}
+    played = record.evaluation or {}
+    absolute = {name: list(map(float, played[name])) for name in (task.score, "episode_return")}
     for name, values in ((task.score, record.scores), ("episode_return", record.returns)):
-        means = [mean_between(record, values, end - task.end / STEPS, end) for end in ends]
+        starts = ends - task.end / STEPS
+        means = [mean_between(record, values, *at) for at in zip(starts, ends, strict=True)]
         columns[name] = held(np.array(means))
+    for values in (columns, absolute):  # under a name that all tasks have, too
+        values["score"] = values[task.score]
     points = {
         f"step_{i}": {"step_count": round(end)}
         | {name: [float(values[i])] for name, values in columns.items()}
         for i, end in enumerate(ends)
     }
-    played = record.evaluation or {}
-    return points | {"absolute_metrics": {name: list(map(float, played[name])) for name in columns}}
+    return points | {"absolute_metrics": absolute}
 
 
 def held(values: np.ndarray) -> np.ndarray:

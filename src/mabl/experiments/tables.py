@@ -1,6 +1,6 @@
 """A report's tables: numbers for files, and cells for people."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -231,7 +231,7 @@ def episodes_of(task: Task) -> str:
     return f"{' or '.join(map(str, sorted(counts)))} episodes" if counts else "episodes"
 
 
-def shown(value: float | NDArray[np.floating]) -> str:
+def shown(value: Any) -> str:
     """Three significant digits, two decimals at most."""
     number = float(value)
     if np.isnan(number):
