@@ -49,6 +49,7 @@ def make_run(
     ]
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     if evaluation is not None:
+        (path / "checkpoints" / f"step_{rows[-1]['step']}").mkdir(parents=True)
         played = {"step": rows[-1]["step"], name: evaluation, "episode_return": evaluation}
         (path / "evaluation.json").write_text(json.dumps(played))
     return path

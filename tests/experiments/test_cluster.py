@@ -5,7 +5,7 @@ import os
 
 import pytest
 from rich.console import Console
-from tests.experiments.tiny_suite import finish, rows_of, runs_of, write_suite
+from tests.experiments.tiny_suite import finish, rows_of, runs_of, wait_for, write_suite
 
 from mabl import UserError
 from mabl.experiments.cluster import RayBackend, place_of
@@ -70,6 +70,20 @@ def test_a_suite_survives_the_loss_of_a_node(cluster, suite, tmp_path):
     assert sorted(job.log.read_text().count("compiling") for job in jobs) == [1, 2]
     for name in ALGORITHMS:
         assert rows_of(logdir, name, 0) == rows_of(undisturbed, name, 0)
+
+
+def test_jobs_of_a_cluster_save_and_end_when_told(cluster, tmp_path):
+    """Though they have long to go."""
+    suite = write_suite(tmp_path, {"mappo": {}}, 10_000_000, seeds=1)
+    (job,) = jobs_of(load(str(suite)), tmp_path / "tiny")
+    job.write()
+    backend = RayBackend(cluster.address)
+    backend.submit(job)
+    wait_for(lambda: any(tmp_path.glob("tiny/test/*/mappo/seed_0/*/checkpoints/step_*")))
+    backend.stop()
+    codes = {}
+    wait_for(lambda: codes.update(backend.ended()) or bool(codes), 60)
+    assert codes[job.name] != 0 and "interrupted at" in job.log.read_text()
 
 
 def test_what_no_node_has_room_for_is_refused(cluster, suite, tmp_path):

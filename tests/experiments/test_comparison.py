@@ -1,5 +1,7 @@
 """What a report says of runs, worked out by hand."""
 
+import json
+
 import numpy as np
 import pytest
 from tests.experiments.runs import make_comparison, make_run
@@ -131,3 +133,69 @@ def test_where_nothing_is_finished_one_is_told(tmp_path):
         collect([tmp_path])
     with pytest.raises(UserError, match="there is no folder"):
         collect([tmp_path / "none"])
+
+
+def test_runs_with_older_settings_do_not_count(tmp_path):
+    """Not even where the newer ones did not end: that is what is said then."""
+    for seed in range(3):
+        make_run(tmp_path, [0.1] * 20, seed=seed)
+    make_run(tmp_path, [0.9] * 20, precision="float32")
+    make_run(tmp_path, [0.9] * 10, seed=1, precision="float32", total_steps=20_000)
+    comparison = compare(tmp_path)
+    assert comparison.superseded == 3
+    assert comparison.tasks[0].groups["mabl"].final == pytest.approx([0.9])
+    assert [(gap.seed, gap.reason) for gap in comparison.missing] == [
+        (1, "unfinished: 10,000 of 20,000 steps")
+    ]
+
+
+def test_a_seed_whose_last_episode_is_long_ago_counts_with_it(tmp_path):
+    make_run(tmp_path, [0.2] * 60)
+    path = make_run(tmp_path, [0.4] * 60, seed=1)
+    rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    for row in rows[30:]:
+        for name in [name for name in row if name.startswith("train/")]:
+            del row[name]
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert compare(tmp_path).tasks[0].groups["mabl"].final == pytest.approx([0.2, 0.4])
+
+
+def test_an_evaluation_of_an_older_policy_is_not_the_trained_ones(tmp_path):
+    path = make_run(tmp_path, [0.2] * 20, evaluation=[1.0])
+    assert compare(tmp_path).tasks[0].groups["mabl"].greedy == [1.0]
+    (path / "checkpoints" / "step_20001").mkdir()
+    assert np.isnan(compare(tmp_path).tasks[0].groups["mabl"].greedy).all()
+
+
+SPOILT = {
+    "config.yaml": "algo: nobody\n",
+    "metrics.jsonl": "[]\n[]\n",
+    "evaluation.json": '{"step": 20000}',
+    "versions.yaml": "3",
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_a_spoilt_run_is_named_and_the_others_are_compared(name, tmp_path):
+    make_run(tmp_path, [0.2] * 20)
+    (make_run(tmp_path, [0.9] * 20, seed=1, evaluation=[1.0]) / name).write_text(SPOILT[name])
+    comparison = compare(tmp_path)
+    assert len(comparison.unread) == 1
+    assert comparison.tasks[0].groups["mabl"].final == pytest.approx([0.2])
+
+
+def test_what_is_no_job_is_named(tmp_path):
+    make_run(tmp_path, [0.2] * 20)
+    (tmp_path / "sub" / "jobs").mkdir(parents=True)
+    for k, text in enumerate(("3", "{config: {}}", "{seeds: [0]}", "a: [", "{config: {algo: x}}")):
+        (tmp_path / "sub" / "jobs" / f"{k}.yaml").write_text(text)
+    unread = compare(tmp_path).unread
+    assert len(unread) == 5 and all("is not a job of a suite" in one for one in unread)
+
+
+def test_of_many_algorithms_the_best_is_compared_with_each(tmp_path):
+    for k in range(8):
+        make_run(tmp_path, [k / 10] * 20, label=f"mabl-{k}")
+    assert list(compare(tmp_path).improvements) == [
+        ("mabl-7", f"mabl-{k}") for k in range(6, -1, -1)
+    ]

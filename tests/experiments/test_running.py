@@ -16,7 +16,8 @@ from tests.experiments.tiny_suite import (
 )
 
 from mabl import cli
-from mabl.experiments.jobs import read_job
+from mabl.experiments.jobs import read_job, steps_done
+from mabl.experiments.running import Tally, conclude
 
 STEPS = 1_000
 
@@ -107,3 +108,24 @@ def test_one_job_can_be_run_by_hand(undisturbed, mabl):
     (file,) = (undisturbed / "tiny" / "jobs").glob("*seeds-0-1.yaml")
     assert read_job(file).is_done()
     assert mabl("job", file)[0] == 0
+
+
+def test_a_job_that_a_signal_kills_is_shown_and_goes_on_next_time(undisturbed):
+    (file,) = (undisturbed / "tiny" / "jobs").glob("*seeds-0-1.yaml")
+    job, tally = read_job(file), Tally()
+    conclude(job, -signal.SIGKILL, tally, None)
+    assert "killed by SIGKILL" in tally.failed[job.name] and not job.failed.exists()
+    conclude(job, -signal.SIGTERM, tally, signal.SIGTERM)
+    assert tally.broken == [job]
+
+
+def test_a_job_whose_last_checkpoint_is_damaged_is_finished_again(undisturbed, mabl):
+    (file,) = (undisturbed / "tiny" / "jobs").glob("*seeds-0-1.yaml")
+    job = read_job(file)
+    run = job.runs()[0]
+    before = rows_of(undisturbed, "mappo", 0)
+    newest = run / "checkpoints" / f"step_{steps_done(run)}"
+    (newest / "policy.safetensors").write_bytes(b"no")
+    (run / "evaluation.json").unlink()
+    assert not job.is_done() and mabl("job", file)[0] == 0 and job.is_done()
+    assert rows_of(undisturbed, "mappo", 0) == before

@@ -96,3 +96,17 @@ def test_what_was_not_one_program_is_not_resumed_as_one(two_seeds):
         resume([short[0], long[1]])
     with pytest.raises(UserError, match="the same seed"):
         resume([short[0], short[0]])
+
+
+def test_runs_without_a_checkpoint_in_common_keep_what_they_have(two_seeds):
+    runs = two_seeds("one", 200)
+    steps = [Checkpoints(path / "checkpoints").steps for path in runs]
+    for k, path in enumerate(runs):
+        checkpoints = Checkpoints(path / "checkpoints")
+        for step in steps[k]:
+            checkpoints.at(step).rename(checkpoints.at(step + k))
+    with pytest.raises(UserError, match="resume them one by one"):
+        resume(runs, 300)
+    assert [len(Checkpoints(path / "checkpoints").steps) for path in runs] == [
+        len(s) for s in steps
+    ]

@@ -61,6 +61,8 @@ def suite(arguments: list[str]) -> int:
     from mabl.experiments.running import run_jobs
     from mabl.experiments.suite import load, narrowed
 
+    for name in ("num_seeds", "total_steps"):
+        check_above_0(given, name)
     chosen = narrowed(load(given.suite), given.tasks, given.algorithms)
     told = {"seeds": given.num_seeds, "cpus": given.cpus, "gpus": given.gpus}
     chosen = replace(chosen, **{name: new for name, new in told.items() if new is not None})
@@ -77,7 +79,10 @@ def suite(arguments: list[str]) -> int:
 
 def backend_of(given: Any, cpus: float) -> Any:
     """Where jobs are to run. Raises UserError if they cannot."""
+    check_above_0(given, "parallel")
     if given.backend == "ray":
+        if given.parallel:
+            raise UserError("--parallel is of this machine: with --backend ray give --cpus")
         from mabl.experiments.cluster import RayBackend
 
         return RayBackend(given.address, cpus)
@@ -86,6 +91,13 @@ def backend_of(given: Any, cpus: float) -> Any:
     from mabl.experiments.processes import LocalBackend
 
     return LocalBackend(cpus, given.parallel)
+
+
+def check_above_0(given: Any, name: str) -> None:
+    """Raise UserError unless a number is None or above 0."""
+    value = getattr(given, name)
+    if value is not None and value <= 0:
+        raise UserError(f"--{name.replace('_', '-')} is {value}: give a number above 0")
 
 
 def list_suites() -> int:
@@ -161,7 +173,10 @@ def report(arguments: list[str]) -> int:
             f"missing: {gap.algorithm} on {gap.task}, seed {gap.seed}: {gap.reason}",
             highlight=False,
             soft_wrap=True,
+            markup=False,
         )
+    for one in written.comparison.unread:
+        console.print(f"not read: {one}", highlight=False, soft_wrap=True, markup=False)
     if written.without_marl_eval:
         console.print(f"no marl_eval.json: {written.without_marl_eval}", highlight=False)
     print(written.page)
@@ -193,9 +208,7 @@ def sweep(arguments: list[str]) -> int:
     default, rest = chosen_preset(arguments, "mabl sweep")
     config, given = parse_with_config(rest, default, "mabl sweep", sweep.__doc__, *SWEEP)
     for name in ("trials", "cpus", "eval_episodes"):
-        if getattr(given, name) <= 0:
-            flag = name.replace("_", "-")
-            raise UserError(f"--{flag} is {getattr(given, name)}: give a number above 0")
+        check_above_0(given, name)
     from mabl.experiments.sweep import Search, flags_of, run_search
 
     search = Search(

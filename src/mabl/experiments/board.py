@@ -1,18 +1,19 @@
 """What a person sees while jobs run: all of them in one table, live on a terminal."""
 
-import json
 import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
+from rich.text import Text
 
+from mabl.experiments.following import TAIL, Follower, newest_mean
 from mabl.experiments.jobs import Job
 from mabl.runs.metrics import Row, score_name
 from mabl.training.progress import duration
@@ -23,20 +24,6 @@ if TYPE_CHECKING:
 LINE_EVERY = 30.0
 """Seconds between lines where there is no terminal."""
 
-TAIL = 65_536
-"""Bytes at the end of a run's metrics that tell how it is going."""
-
-EPISODES = 100
-"""Episodes over which scores are averaged, at least."""
-
-
-class Standing(NamedTuple):
-    """How far a run is."""
-
-    step: float
-    score: float
-    """Mean over its newest training episodes; NaN before the first."""
-
 
 class Board:
     """All jobs, their states, steps and scores."""
@@ -45,6 +32,7 @@ class Board:
         self._console, self._jobs, self._tally = console, jobs, tally
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._said: dict[str, str] = {}
+        self._runs: dict[Path, Follower] = {}
         self._began: dict[str, tuple[float, float]] = {}
         self._last_line = time.monotonic()
 
@@ -81,7 +69,7 @@ class Board:
                     self._line(job, self._progress(job)[0])
 
     def _line(self, job: Job, what: str) -> None:
-        self._console.print(f"{job.name}: {what}", highlight=False, soft_wrap=True)
+        self._console.print(f"{job.name}: {what}", highlight=False, soft_wrap=True, markup=False)
 
     def _state(self, job: Job, running: set[str]) -> str:
         tally = self._tally
@@ -94,13 +82,12 @@ class Board:
 
     def _progress(self, job: Job) -> tuple[str, float]:
         """Steps, score and time left of a running job in words; and its steps."""
-        standings = [standing(path) for seed in job.seeds if (path := newest(job, seed))]
-        if not standings:
-            return "starting", 0.0
-        step = min(run.step for run in standings)
+        runs = [self._rows(path) for seed in job.seeds if (path := newest(job, seed))]
+        step = min((rows[-1]["step"] if rows else 0.0 for rows in runs), default=0.0)
         if not step:
             return "starting", 0.0
-        scores = [run.score for run in standings if math.isfinite(run.score)]
+        scores = [newest_mean(rows, f"train/{score_name(rows)}") for rows in runs]
+        scores = [score for score in scores if math.isfinite(score)]
         words = f"{step:,.0f} of {job.config.total_steps:,} steps"
         if scores:
             words += f", score {sum(scores) / len(scores):.2f}"
@@ -109,6 +96,11 @@ class Board:
         if steps > 0 and step < job.config.total_steps:
             words += f", {duration((job.config.total_steps - step) * seconds / steps)} left"
         return words, step
+
+    def _rows(self, run: Path) -> list[Row]:
+        metrics = self._runs.setdefault(run, Follower(run / "metrics.jsonl", TAIL))
+        metrics.read()
+        return metrics.rows
 
     def _table(self, states: dict[str, str]) -> Table:
         table = Table(box=None, padding=(0, 1), title=self._tally.says())
@@ -124,7 +116,7 @@ class Board:
                 words = self._tally.failed[job.name]
             first, last = job.seeds[0], job.seeds[-1]
             seeds = f"{first}-{last}" if last > first else f"{first}"
-            table.add_row(job.config.env, job.config.name, seeds, state, bar, words)
+            table.add_row(job.config.env, job.config.name, seeds, state, bar, Text(words))
         return table
 
 
@@ -133,31 +125,3 @@ def newest(job: Job, seed: int) -> Path | None:
     config = job.config
     parent = Path(config.logdir) / config.env / config.name / f"seed_{seed}"
     return max(parent.glob("*/"), default=None)
-
-
-def standing(run: Path) -> Standing:
-    """Of a run, from the end of its metrics."""
-    rows = tail(run / "metrics.jsonl")
-    if not rows:
-        return Standing(0, math.nan)
-    total = episodes = 0.0
-    name = f"train/{score_name(rows)}"
-    for row in reversed(rows):
-        if n := row.get("train/episodes", 0):
-            total, episodes = total + n * row[name], episodes + n
-        if episodes >= EPISODES:
-            break
-    return Standing(rows[-1]["step"], total / episodes if episodes else math.nan)
-
-
-def tail(path: Path) -> list[Row]:
-    """The newest whole rows of a file of metrics that is being written."""
-    try:
-        with path.open("rb") as file:
-            size = file.seek(0, 2)
-            file.seek(max(0, size - TAIL))
-            lines = file.read().split(b"\n")
-    except OSError:
-        return []
-    whole = lines[:-1] if size <= TAIL else lines[1:-1]
-    return [json.loads(line) for line in whole]

@@ -6,7 +6,7 @@ in its run folders.
 
 import os
 import signal
-import subprocess
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ from mabl.experiments.processes import start
 RETRIES = 20
 """Times that a job is started again after its node was lost."""
 
-GRACE = 60.0
-"""Seconds that a job which is told to stop has for the end of its cycle."""
+POLL_EVERY = 0.2
+"""Seconds between looks whether a process has ended."""
 
 
 class RayBackend:
@@ -94,12 +94,12 @@ def _run(cwd: Path, job: Job) -> int:
     place_of(job).write_text(os.uname().nodename)
     process = start(job)
     try:
-        return process.wait()
-    except BaseException:  # cancelled
+        while process.poll() is None:  # not in one wait, which no cancellation would end
+            time.sleep(POLL_EVERY)
+        return process.returncode
+    except BaseException:  # cancelled: it saves at the end of its cycle
         process.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(GRACE)
+        process.wait()
         raise
     finally:
-        process.kill()
         place_of(job).unlink(missing_ok=True)

@@ -33,6 +33,10 @@ UNIT_SCORES = ("win_rate", "arrived")
 """Scores from 0 to 1."""
 
 
+PAIRED = 6
+"""Algorithms, at most, of which every pair is compared."""
+
+
 class Group(NamedTuple):
     """An algorithm's seeds on a task."""
 
@@ -67,8 +71,7 @@ class Task:
         records = sorted(records, key=lambda record: record.config.seed)
 
         def final(name: str) -> NDArray[np.floating]:
-            start = self.end - self.last
-            return np.array([mean_between(r, getattr(r, name), start, self.end) for r in records])
+            return np.array([newest(r, getattr(r, name), self.last, self.end) for r in records])
 
         greedy = [np.mean(r.evaluation[self.score]) if r.evaluation else np.nan for r in records]
         curves = np.stack([curve(r, self.grid) for r in records])
@@ -106,6 +109,7 @@ class Comparison:
     def __init__(self, found: Found):
         self.records, self.superseded = found.records, found.superseded
         self.missing: list[Missing] = found.missing
+        self.unread = found.unread
         names = {record.config.name for record in found.records}
         known = [name for name in ALGORITHMS if name in names]
         self.algorithms = [*known, *sorted(names - set(known))]
@@ -133,11 +137,14 @@ class Comparison:
 
     @cached_property
     def improvements(self) -> dict[tuple[str, str], Estimate]:
-        """Probability that the first beats the second, each pair once."""
+        """Probability that the first beats the second: of each pair, or of many only the best's."""
         names = self.everywhere
+        if len(names) > PAIRED:
+            iqms = self.aggregates["IQM"]
+            names = sorted(names, key=lambda name: -float(iqms[name].value))
         return {
             (one, other): estimate(improvement, *self.normalised(one), *self.normalised(other))
-            for k, one in enumerate(names)
+            for k, one in enumerate(names if len(names) <= PAIRED else names[:1])
             for other in names[k + 1 :]
         }
 
@@ -165,6 +172,14 @@ def mean_between(record: Record, values: NDArray[np.floating], start: float, end
     inside = (record.steps > start) & (record.steps <= end)
     episodes = record.episodes[inside]
     return float((episodes * values[inside]).sum() / episodes.sum()) if episodes.sum() else np.nan
+
+
+def newest(record: Record, values: NDArray[np.floating], last: float, end: float) -> float:
+    """Mean over the training episodes of the last steps; of the last cycle before in which any
+    ended, where none ended in them."""
+    known = np.flatnonzero((record.steps <= end) & ~np.isnan(values))
+    found = mean_between(record, values, end - last, end)
+    return float(values[known[-1]]) if np.isnan(found) and len(known) else found
 
 
 def curve(record: Record, grid: NDArray[np.floating]) -> NDArray[np.floating]:

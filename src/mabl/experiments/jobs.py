@@ -25,10 +25,11 @@ from mabl.experiments.suite import Suite, slug
 from mabl.runs.checkpoint import Checkpoints
 from mabl.runs.files import replace_file
 from mabl.runs.folder import read_config
+from mabl.training.run import PLACEMENT
 
 EVALUATION = "evaluation.json"
 
-ELSEWHERE = ("total_steps", "logdir", "num_devices", "workers", "num_workers", "worker_timeout")
+ELSEWHERE = ("total_steps", *PLACEMENT)
 """Fields in which a run may differ from what is wanted, and still be it."""
 
 
@@ -49,7 +50,7 @@ class Job:
         """For files and people."""
         first, last = self.seeds[0], self.seeds[-1]
         seeds = f"seed-{first}" if first == last else f"seeds-{first}-{last}"
-        return slug((self.config.env, self.config.name, seeds))
+        return slug((self.config.env, *self.config.env_kwargs, self.config.name, seeds))
 
     @property
     def folder(self) -> Path:
@@ -101,8 +102,15 @@ class Job:
 
 
 def read_job(path: Path) -> Job:
-    """A job's file, as `Job.write` wrote it."""
-    return from_dict(Job, plain_yaml.load(path.read_text(encoding="utf-8")))
+    """A job's file, wherever its folder was moved to. Raises UserError if it is none."""
+    try:
+        job = from_dict(Job, plain_yaml.load(path.read_text(encoding="utf-8")))
+        if not job.seeds:
+            raise ValueError("it has no seeds")
+        unread(job.config.algo)
+    except (OSError, ValueError, TypeError, UserError) as error:
+        raise UserError(f"{path} is not a job of a suite ({error})") from error
+    return replace(job, config=replace(job.config, logdir=str(path.parent.parent)))
 
 
 def jobs_of(suite: Suite, logdir: Path, total_steps: int | None = None) -> list[Job]:
@@ -139,11 +147,10 @@ def find_run(config: Config) -> Path | None:
     wanted = comparable(config)
     for path in sorted(parent.glob("*/config.yaml"), reverse=True):
         try:  # its environment is the one that is asked for, if it is the same
-            found = read_config(path.parent, trust=True)
+            if comparable(read_config(path.parent, trust=True)) == wanted:
+                return path.parent
         except UserError:
             continue
-        if comparable(found) == wanted:
-            return path.parent
     return None
 
 

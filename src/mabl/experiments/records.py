@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,10 +14,20 @@ from safetensors import SafetensorError, safe_open
 from mabl import plain_yaml
 from mabl.algorithms.config import Config
 from mabl.errors import UserError
-from mabl.experiments.jobs import EVALUATION, Job, read_job
+from mabl.experiments.jobs import (
+    EVALUATION,
+    Job,
+    comparable,
+    evaluated_at,
+    read_job,
+    steps_done,
+)
 from mabl.runs.checkpoint import Checkpoints
 from mabl.runs.folder import read_config
 from mabl.runs.metrics import read, score_name
+
+NO_PARAMETERS = ("opt.", "target.", ".returns.", ".ent_coef", ".epsilon")
+"""In names of what a learner has beside the parameters of its networks."""
 
 
 class Record(NamedTuple):
@@ -40,7 +51,7 @@ class Record(NamedTuple):
     imagined: float
     """Joint steps imagined and learned from."""
     parameters: int | None
-    """Numbers that learning changes; None without a checkpoint."""
+    """Of its networks; None without a checkpoint."""
     evaluation: dict[str, Any] | None
     versions: dict[str, str]
 
@@ -70,8 +81,11 @@ class Found(NamedTuple):
     records: list[Record]
     """Finished runs, one for each task, algorithm and seed: the newest."""
     missing: list[Missing]
+    unread: list[str]
+    """What cannot be read, and why."""
     superseded: int
-    """Finished runs that have a newer one of the same task, algorithm and seed."""
+    """Finished runs that are left out: there is a newer one of the same seed, or a newer one of the
+    same task and algorithm with other settings."""
 
 
 def task_name(config: Config) -> str:
@@ -80,62 +94,107 @@ def task_name(config: Config) -> str:
 
 
 def collect(paths: Sequence[Path]) -> Found:
-    """All runs under some folders. Raises UserError if there are none that are finished."""
+    """All runs under some folders. Raises UserError if there are none that are finished.
+
+    The newest run of a task and an algorithm, or else the suite's job, says which settings count.
+    """
+    configs: dict[Path, Config] = {}
+    finished: dict[tuple[str, str, int], Record] = {}
+    reasons: dict[tuple[str, str, int], str] = {}
+    unread: list[str] = []
+    for folder in run_folders(paths):
+        try:
+            configs[folder] = read_config(folder, trust=True)
+            comparable(configs[folder])
+        except UserError as error:
+            unread.append(str(error))
+            configs.pop(folder, None)
+    wanted = {(task_name(c), c.name): settings_of(c) for c in configs.values()}
+    jobs = jobs_under(paths, unread)
+    wanted |= {(task_name(job.config), job.config.name): settings_of(job.config) for job, _ in jobs}
+    superseded = 0
+    for folder, config in configs.items():
+        key = task_name(config), config.name, config.seed
+        try:
+            record = read_record(folder, config)
+        except (UserError, ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+            unread.append(f"{folder}: {error}")
+            continue
+        other = settings_of(config) != wanted[key[:2]]
+        if isinstance(record, Record) and record.finished:
+            superseded += other or key in finished
+            if not other:
+                finished[key] = record
+        elif not other:
+            done = record if isinstance(record, int) else record.last_step
+            reasons[key] = (
+                "no episode ended"
+                if done >= config.total_steps
+                else f"unfinished: {done:,} of {config.total_steps:,} steps"
+            )
+    for job, failure in jobs:
+        for seed in job.seeds:
+            key = task_name(job.config), job.config.name, seed
+            reasons[key] = failure or reasons.get(key, "not begun")
+    if not finished:
+        where = ", ".join(map(str, paths))
+        odd = f" ({unread[0]})" if unread else ""
+        raise UserError(f"no finished run under {where}{odd}: wait for its end, or train first")
+    gaps = [Missing(*key, why) for key, why in sorted(reasons.items()) if key not in finished]
+    return Found(list(finished.values()), gaps, unread, superseded)
+
+
+def run_folders(paths: Sequence[Path]) -> list[Path]:
+    """Those under some folders, the oldest first. Raises UserError if there is no such folder."""
     folders: list[Path] = []
     for path in paths:
         if not path.is_dir():
             raise UserError(f"there is no folder {path}: give run folders, or folders of them")
         folders += sorted(file.parent for file in path.rglob("config.yaml"))
-    finished: dict[tuple[str, str, int], Record] = {}
-    missing: dict[tuple[str, str, int], Missing] = {}
-    superseded = 0
-    for folder in sorted(dict.fromkeys(folders), key=lambda folder: folder.name):
-        record = read_record(folder)
-        if record is None or not record.finished:
-            config = record.config if record else read_config(folder, trust=True)
-            done = record.last_step if record else 0
-            reason = f"unfinished: {done:,} of {config.total_steps:,} steps"
-            key = task_name(config), config.name, config.seed
-            missing[key] = Missing(*key, reason)
-            continue
-        superseded += record.key in finished
-        finished[record.key] = record
-    for job, reason in jobs_under(paths):
-        for seed in job.seeds:
-            key = task_name(job.config), job.config.name, seed
-            if reason or key not in missing:
-                missing[key] = Missing(*key, reason or "not begun")
-    if not finished:
-        where = ", ".join(map(str, paths))
-        raise UserError(f"no finished run under {where}: wait for its end, or train first")
-    left = [gap for key, gap in sorted(missing.items()) if key not in finished]
-    return Found(list(finished.values()), left, superseded)
+    return sorted(dict.fromkeys(folders), key=lambda folder: folder.name)
 
 
-def jobs_under(paths: Sequence[Path]) -> Iterator[tuple[Job, str]]:
-    """Jobs of suites, and why they failed, if they did."""
-    for path in paths:
-        for file in sorted(path.glob("jobs/*.yaml")):
-            failed = file.with_suffix(".failed")
-            yield read_job(file), f"failed: {failed.read_text().strip()}" if failed.exists() else ""
+def settings_of(config: Config) -> Config:
+    """What two seeds of one algorithm have in common."""
+    return replace(comparable(config), seed=0)
 
 
-def read_record(folder: Path) -> Record | None:
-    """A run; None before its first episode ended."""
+def jobs_under(paths: Sequence[Path], unread: list[str]) -> list[tuple[Job, str]]:
+    """Jobs of suites, and why they failed, if they did. Adds to `unread` what is none."""
+    jobs = []
+    for file in sorted(file for path in paths for file in path.rglob("jobs/*.yaml")):
+        failed = file.with_suffix(".failed")
+        try:
+            why = f"failed: {failed.read_text().strip()}" if failed.exists() else ""
+            jobs.append((read_job(file), why))
+        except (UserError, OSError, ValueError) as error:
+            unread.append(str(error))
+    return jobs
+
+
+def read_record(folder: Path, config: Config | None = None) -> Record | int:
+    """A run; before its first episode ended, the steps that it has done.
+
+    Raises UserError, ValueError, KeyError, TypeError or AttributeError for what is no run's.
+    """
     rows = read(folder)
     score = score_name(rows)
     if score is None:
-        return None
-    ended = [row for row in rows if row.get("train/episodes")]
+        return int(rows[-1]["step"]) if rows else 0
+    ended = [row for row in rows if row.get("train/episodes") and f"train/{score}" in row]
 
     def column(name: str) -> NDArray[np.floating]:
-        return np.array([row[name] for row in ended], float)
+        return np.array([row.get(name, np.nan) for row in ended], float)
 
-    evaluation = folder / EVALUATION
     versions = folder / "versions.yaml"
+    evaluation = folder / EVALUATION
+    played = json.loads(evaluation.read_text()) if evaluated_at(folder) is not None else None
+    if played is not None:
+        for name in (score, "episode_return"):
+            np.array(played[name], float)
     return Record(
         folder=folder,
-        config=read_config(folder, trust=True),
+        config=config or read_config(folder, trust=True),
         score=score,
         steps=column("step"),
         episodes=column("train/episodes"),
@@ -145,13 +204,13 @@ def read_record(folder: Path) -> Record | None:
         seconds=sum(row.get("time/seconds", 0.0) for row in rows),
         imagined=sum(row.get("train/imagined_steps", 0.0) for row in rows),
         parameters=count_parameters(folder),
-        evaluation=json.loads(evaluation.read_text()) if evaluation.exists() else None,
-        versions=plain_yaml.load(versions.read_text()) if versions.exists() else {},
+        evaluation=played if evaluated_at(folder) == steps_done(folder) else None,
+        versions=dict(plain_yaml.load(versions.read_text())) if versions.exists() else {},
     )
 
 
 def count_parameters(folder: Path) -> int | None:
-    """Numbers that learning changes, without optimisers and target networks; None if unknown."""
+    """Of networks, without their optimisers and targets; None if unknown."""
     checkpoints = folder / "checkpoints"
     steps = Checkpoints(checkpoints).steps if checkpoints.is_dir() else []
     if not steps:
@@ -161,8 +220,7 @@ def count_parameters(folder: Path) -> int | None:
             return sum(
                 math.prod(file.get_slice(name).get_shape())
                 for name in file.keys()  # noqa: SIM118 (it is no dict)
-                if name.startswith("learner.")
-                and not any(part in name for part in ("opt.", "target."))
+                if name.startswith("learner.") and not any(part in name for part in NO_PARAMETERS)
             )
     except (OSError, SafetensorError):
         return None

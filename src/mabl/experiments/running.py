@@ -84,6 +84,9 @@ class Running:
         Raises UserError where it cannot.
         """
         self._jobs.append(job)
+        if self.stopping:
+            self.tally.broken.append(job)
+            return
         if retry:
             job.failed.unlink(missing_ok=True)
         if job.is_done():
@@ -128,11 +131,17 @@ def run_jobs(jobs: Sequence[Job], backend: Backend, console: Console, retry: boo
 
 
 def conclude(job: Job, code: int, tally: Tally, stopped: Any) -> None:
-    """Sort a job that ended by its exit code."""
-    if code == 0:
+    """Sort a job that ended by its exit code.
+
+    What a signal killed is shown with what failed, and goes on next time all the same.
+    """
+    if code == 0 and job.is_done():
         tally.done.append(job)
-    elif code == PREEMPTED or code < 0 or stopped:
+    elif code == PREEMPTED or stopped:
         tally.broken.append(job)
+    elif code < 0:
+        killed = signal.Signals(-code).name
+        tally.failed[job.name] = f"killed by {killed} (out of memory?); the next run goes on"
     else:
         reason = last_words(job.log) or f"exit code {code}"
         job.failed.write_text(f"{reason}\n")

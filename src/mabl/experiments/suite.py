@@ -28,6 +28,9 @@ SHIPPED = files("mabl.experiments") / "suites"
 SUITE_SIZE = 1_000_000
 """Characters of a suite's file, at most."""
 
+OWN = ("env", "env_kwargs", "algo", "label", "preset", "seed", "num_seeds", "logdir")
+"""Fields of a run's config that a suite, or a sweep, decides otherwise."""
+
 Changes = Mapping[str, Any]
 
 
@@ -80,6 +83,13 @@ class Suite:
     def __post_init__(self) -> None:
         require_positive(self, "seeds", "seeds_per_job", "cpus", "eval_episodes")
         require_between(self, 0, inf, "gpus", "first_seed")
+        if not re.fullmatch(r"\w[\w.+-]{0,60}", self.name):
+            raise UserError(f"suite name is {self.name!r}: give letters, digits, and - _ + .")
+        for changes in (self, *self.tasks, *self.algorithms):
+            if own := [name for name in changes.config if name in OWN]:
+                raise UserError(
+                    f"config of suite {self.name} has {own[0]}: it is the suite's to say"
+                )
         for what in ("tasks", "algorithms"):
             if not getattr(self, what):
                 raise UserError(f"suite {self.name} has no {what}: give at least one")

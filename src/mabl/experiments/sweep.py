@@ -6,8 +6,9 @@ LOGDIR/study.db      the study, in SQLite: it goes on where it was left
 
 import csv
 import logging
+import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,13 +17,14 @@ from rich.console import Console
 
 from mabl import plain_yaml
 from mabl.algorithms.config import Config
+from mabl.algorithms.presets import preset
 from mabl.errors import UserError
-from mabl.experiments.comparison import LAST, mean_between
+from mabl.experiments.comparison import LAST, newest
 from mabl.experiments.jobs import Job
 from mabl.experiments.processes import Backend
-from mabl.experiments.records import read_record
+from mabl.experiments.records import Record, read_record
 from mabl.experiments.running import Running
-from mabl.experiments.suite import changed
+from mabl.experiments.suite import OWN, changed
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -76,17 +78,11 @@ def run_search(search: Search, backend: Backend, console: Console) -> "tuple[Stu
     optuna = _optuna()
     space = parse_space(search.space)
     probe(search, space)
-    search.logdir.mkdir(parents=True, exist_ok=True)
-    study = optuna.create_study(
-        study_name=search.logdir.name,
-        storage=search.storage or f"sqlite:///{search.logdir / 'study.db'}",
-        sampler=optuna.samplers.TPESampler(seed=search.config.seed),
-        direction="maximize",
-        load_if_exists=True,
-    )
+    study = open_study(search)
     check_same(study, search, space)
     states = optuna.trial.TrialState
     numbers: dict[str, int] = {}
+    """Of trials whose jobs are not told yet, by name."""
 
     def add(number: int, chosen: dict[str, Any]) -> None:
         job = search.job(number, chosen)
@@ -95,33 +91,58 @@ def run_search(search: Search, backend: Backend, console: Console) -> "tuple[Stu
 
     with Running(backend, console) as running:
         for trial in study.get_trials(states=[states.RUNNING]):
-            add(trial.number, trial.params)
-        tell(study, running, numbers, [])
+            if set(trial.params) == set(space):
+                add(trial.number, trial.params)
+            else:  # it was being proposed when the search was killed
+                study.tell(trial.number, state=states.FAIL)
         while True:
+            tell(study, running, numbers)
+            write_trials(study, search.logdir / "trials.csv")
             ended = len(study.get_trials(states=[states.COMPLETE, states.FAIL]))
             while (
                 not running.stopping
                 and len(running.going) < backend.slots
-                and ended + len(running.going) < search.trials
+                and ended + len(numbers) < search.trials
             ):
                 trial = study.ask(space)
                 add(trial.number, trial.params)
             if not running.goes_on:
                 break
-            tell(study, running, numbers, running.wait())
-            write_trials(study, search.logdir / "trials.csv")
+            running.wait()
+        tell(study, running, numbers)
+    write_trials(study, search.logdir / "trials.csv")
     return study, running
 
 
-def tell(study: "Study", running: Running, numbers: dict[str, int], ended: Sequence[Job]) -> None:
-    """Have the study know what became of jobs; those that are to go on stay as they are."""
+def open_study(search: Search) -> "Study":
+    """The study, made if it is not there. Raises UserError where it cannot be had."""
+    optuna = _optuna()
+    try:
+        search.logdir.mkdir(parents=True, exist_ok=True)
+        return optuna.create_study(
+            study_name=search.logdir.name,
+            storage=search.storage or f"sqlite:///{search.logdir / 'study.db'}",
+            sampler=optuna.samplers.TPESampler(seed=search.config.seed),
+            direction="maximize",
+            load_if_exists=True,
+        )
+    except Exception as error:  # whatever the database's driver has to say
+        where = search.storage or search.logdir / "study.db"
+        reason = f"{error}".strip().partition("\n")[0][:200]
+        raise UserError(
+            f"no study at {where} ({reason}): give another --storage or --name"
+        ) from error
+
+
+def tell(study: "Study", running: Running, numbers: dict[str, int]) -> None:
+    """Have the study know what became of jobs, once; those that are to go on stay as they are."""
     states = _optuna().trial.TrialState
-    done = [*ended, *running.tally.kept]
-    for job in done:
-        if job.name in running.tally.failed:
-            study.tell(numbers[job.name], state=states.FAIL)
-        elif job.is_done():
-            study.tell(numbers[job.name], score_of(job), skip_if_finished=True)
+    for job in (*running.tally.done, *running.tally.kept):
+        if job.name in numbers:
+            study.tell(numbers.pop(job.name), score_of(job))
+    for name in running.tally.failed:
+        if name in numbers:
+            study.tell(numbers.pop(name), state=states.FAIL)
 
 
 def score_of(job: Job) -> float:
@@ -130,10 +151,8 @@ def score_of(job: Job) -> float:
     scores = []
     for path in job.runs().values():
         record = read_record(path) if path else None
-        if record is not None:
-            scores.append(
-                mean_between(record, record.scores, end - min(LAST, end // 4), record.last_step)
-            )
+        if isinstance(record, Record):
+            scores.append(newest(record, record.scores, min(LAST, end // 4), record.last_step))
     return float(np.mean(scores))
 
 
@@ -146,9 +165,20 @@ def settings(config: Config, chosen: dict[str, Any]) -> Config:
 
 
 def flags_of(config: Config, chosen: dict[str, Any]) -> str:
-    """Settings as flags of `mabl train`."""
-    fields = {"env": config.env, "algo": config.algo, "preset": config.preset} | chosen
-    return " ".join(f"--{name.replace('_', '-')} {value}" for name, value in fields.items())
+    """Flags of `mabl train` that make a config with these settings."""
+    usual = asdict(preset(config.preset, config.env, config.algo))
+    flags = {"env": config.env, "algo": config.algo, "preset": config.preset}
+    for name, value in asdict(settings(config, chosen)).items():
+        parts = value.items() if isinstance(value, dict) else [("", value)]
+        for field, new in parts:
+            old = usual[name][field] if field else usual[name]
+            if new != old and name != "logdir":
+                flags[f"{name}.{field}" if field else name] = new
+    words = []
+    for name, value in flags.items():
+        given = value if isinstance(value, tuple | list) else [value]
+        words += [f"--{name.replace('_', '-')}", *map(str, given)]
+    return shlex.join(words)
 
 
 def probe(search: Search, space: "dict[str, BaseDistribution]") -> None:
@@ -173,6 +203,8 @@ def parse_space(space: Sequence[str]) -> "dict[str, BaseDistribution]":
             raise UserError(
                 f"--space {text!r}: give FIELD=LOW..HIGH, FIELD=LOW..HIGH:log or FIELD=A,B,C"
             )
+        if name in OWN:
+            raise UserError(f"--space {name} cannot be searched: give it as a flag")
         if name in found:
             raise UserError(f"--space {name} is there twice: give it once")
         found[name] = _distribution(text, values)
@@ -213,14 +245,13 @@ def _number(text: str) -> int | float:
 
 def check_same(study: "Study", search: Search, space: "dict[str, BaseDistribution]") -> None:
     """Raise UserError if a study that goes on was of other settings."""
-    told = {"space": sorted(map(str, space.items())), "config": repr(search.config)}
-    known = study.user_attrs or told
-    if {name: known.get(name) for name in told} != told:
+    told = [*sorted(map(str, space.items())), repr(search.config)]
+    told += [f"{search.seeds} seeds, {search.eval_episodes} episodes"]
+    if study.user_attrs.get("search", told) != told:
         raise UserError(
             f"{search.logdir} is a sweep of another space or config: give another --name"
         )
-    for name, value in told.items():
-        study.set_user_attr(name, value)
+    study.set_user_attr("search", told)
 
 
 def write_trials(study: "Study", path: Path) -> None:

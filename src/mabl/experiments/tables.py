@@ -55,7 +55,7 @@ def final_scores(task: Task) -> Table:
                 "least": group.final.min(),
                 "greatest": group.final.max(),
                 "return": group.final_return.mean(),
-                "greedy": group.greedy.mean(),
+                "greedy": mean_of_known(group.greedy),
                 "area_under_curve": task.area(group).mean(),
                 "threshold": task.threshold,
                 "median_steps_to_threshold": float(np.median(reached)),
@@ -197,9 +197,16 @@ def spread(values: NDArray[np.floating]) -> float:
     return float(values.std(ddof=1)) if len(values) > 1 else float("nan")
 
 
+def mean_of_known(values: NDArray[np.floating]) -> float:
+    """Over seeds that have a value; NaN without one."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else float("nan")
+
+
 def with_spread(values: NDArray[np.floating]) -> str:
-    """Mean and standard deviation over seeds."""
-    if np.isnan(values).all():
+    """Mean and standard deviation over seeds that have a value."""
+    values = values[~np.isnan(values)]
+    if not len(values):
         return NONE
     return f"{shown(values.mean())} ± {shown(spread(values))}"
 

@@ -3,7 +3,6 @@
 The page that shows it is `watch_page`, which needs the extra `watch`.
 """
 
-import json
 import math
 import os
 import socket
@@ -12,11 +11,11 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from mabl.algorithms.config import Config
 from mabl.errors import UserError
-from mabl.experiments.board import TAIL
+from mabl.experiments.following import TAIL, Follower, newest_mean
 from mabl.experiments.jobs import read_job
 from mabl.experiments.records import task_name
 from mabl.runs.folder import read_config
@@ -36,72 +35,14 @@ POINTS = 500
 KEPT = {"step", "time/seconds", *(name for names in PANELS.values() for name in names)}
 """Metrics that are shown, beside all of `train/`."""
 
+
+def shown(name: str) -> bool:
+    """Whether a metric is."""
+    return name in KEPT or name.startswith("train/")
+
+
 INNER = {"checkpoints", "tensorboard", "videos"}
 """Folders of a run; there are no runs in them."""
-
-
-class Follower:
-    """Rows of one run's metrics, as they are appended; a file that was replaced is read anew."""
-
-    def __init__(self, path: Path, tail: int | None = None):
-        """With `tail`, only the rows in that many bytes at the file's end are read at first."""
-        self._path, self._tail = path, tail
-        self._begin(-1, 0)
-
-    def _begin(self, inode: int, start: int) -> None:
-        self.rows: list[Row] = []
-        self.damaged = 0
-        """Lines that are no rows."""
-        self.torn = False
-        """Whether the newest line has no end: it is being written, or was when a crash came."""
-        self._inode, self._size, self._at = inode, 0, start
-        self._in_mid_line = start > 0
-
-    def read(self) -> bool:
-        """Take in what is new; returns whether there was anything."""
-        try:
-            if self._path.is_symlink() or not self._path.is_file():
-                raise FileNotFoundError
-            with self._path.open("rb") as file:
-                return self._take(file)
-        except OSError:
-            was_there = self._inode != -1
-            self._begin(-1, 0)
-            return was_there
-
-    def _take(self, file: BinaryIO) -> bool:
-        stat = os.fstat(file.fileno())
-        if stat.st_ino != self._inode or stat.st_size < self._size:
-            self._begin(stat.st_ino, max(0, stat.st_size - self._tail) if self._tail else 0)
-        elif stat.st_size == self._size:
-            return False
-        file.seek(self._at)
-        data = file.read()
-        *lines, rest = data.split(b"\n")
-        self._size = self._at + len(data)
-        self._at = self._size - len(rest)
-        self.torn = bool(rest)
-        if lines and self._in_mid_line:
-            self._in_mid_line = False
-            del lines[0]
-        rows = [row for line in lines if (row := parse(line))]
-        self.damaged += len(lines) - len(rows)
-        self.rows += rows
-        return True
-
-
-def parse(line: bytes) -> Row | None:
-    """What is shown of a row of metrics; None if it is none."""
-    try:
-        row = json.loads(line)
-        row["step"] = int(row["step"])
-        return {
-            name: value
-            for name, value in row.items()
-            if (name in KEPT or name.startswith("train/")) and math.isfinite(value)
-        }
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-        return None
 
 
 class Standing(NamedTuple):
@@ -175,7 +116,7 @@ class Watch:
         config = read_again(folder, (stat.st_ino, stat.st_mtime_ns, stat.st_size))
         if isinstance(config, str):
             return Standing(folder, "damaged", None, config)
-        metrics = self._tails.setdefault(folder, Follower(folder / "metrics.jsonl", TAIL))
+        metrics = self._tails.setdefault(folder, Follower(folder / "metrics.jsonl", TAIL, shown))
         metrics.read()
         rows = metrics.rows
         written = max(
@@ -213,7 +154,10 @@ class Watch:
         """Lines of some runs, by panel. Other runs' are forgotten."""
         drawn = {}
         for folder in folders:
-            metrics, lines = self._drawn.get(folder) or (Follower(folder / "metrics.jsonl"), {})
+            metrics, lines = self._drawn.get(folder) or (
+                Follower(folder / "metrics.jsonl", keep=shown),
+                {},
+            )
             drawn[folder] = metrics, panels(metrics.rows) if metrics.read() else lines
         self._drawn = drawn
         return {folder: lines for folder, (_, lines) in drawn.items()}
@@ -247,11 +191,11 @@ def failures(jobs: Sequence[Path]) -> dict[Path, tuple[Config, str]]:
         try:
             job = read_job(file.with_suffix(".yaml"))
             reason = "" if file.is_symlink() else file.read_text(encoding="utf-8").strip()
-        except (UserError, ValueError, OSError):  # it was removed meanwhile, or is damaged
+        except (UserError, OSError):  # it was removed meanwhile, or is damaged
             continue
         for seed in job.seeds:
             config = job.of_seed(seed)
-            parent = file.parents[1] / config.env / config.name / f"seed_{seed}"
+            parent = Path(config.logdir) / config.env / config.name / f"seed_{seed}"
             failed[parent] = config, reason or "it does not say why"
     return failed
 
@@ -266,12 +210,6 @@ def locked_inodes() -> set[int]:
     except OSError:
         return set()
     return {int(line.split()[5].rpartition(":")[2]) for line in lines if " FLOCK " in line}
-
-
-def newest_mean(rows: list[Row], name: str) -> float:
-    """Mean of a metric of training episodes over the newest of them; NaN without one."""
-    _, means = smoothed(rows, name)
-    return means[-1] if means else math.nan
 
 
 def steps_per_second(rows: Sequence[Row]) -> float:

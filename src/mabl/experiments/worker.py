@@ -10,6 +10,7 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
+from mabl.errors import UserError
 from mabl.evaluation import evaluate
 from mabl.experiments.jobs import EVALUATION, Job, evaluated_at, in_a_row, steps_done
 from mabl.policy import load_run
@@ -18,8 +19,8 @@ from mabl.runs.files import replace_file
 from mabl.runs.lock import writing
 from mabl.training.run import resume, train
 
-PATIENCE = 120.0
-"""Seconds that a predecessor, told to stop, has for the end of its cycle."""
+PATIENCE = 20.0
+"""Seconds between words about a run that another process still writes."""
 
 EVALUATION_SEED = 2**32 - 1
 """Of evaluations: other episodes than any in training."""
@@ -27,11 +28,10 @@ EVALUATION_SEED = 2**32 - 1
 
 def work(job: Job, console: Console) -> signal.Signals | None:
     """Do what is left of a job; returns what asked it to end early, if anything did."""
+    wait_for_others([path for path in job.runs().values() if path], console)
     runs = job.runs()
     missing = [seed for seed, path in runs.items() if path is None]
     begun = [path for path in runs.values() if path is not None]
-    with writing(begun, PATIENCE):
-        pass  # whoever was killed with its parent is gone by now
     short = [path for path in begun if steps_done(path) < job.config.total_steps]
     for paths in together(short):
         outcome = resume(paths, job.config.total_steps, trust=True, console=console)
@@ -44,9 +44,23 @@ def work(job: Job, console: Console) -> signal.Signals | None:
             return outcome.stopped_by
     for path in job.runs().values():
         if path is not None and evaluated_at(path) != steps_done(path):
-            evaluate_run(path, job.eval_episodes, job.config.num_workers)
-            console.print(f"evaluated {path}", highlight=False, soft_wrap=True)
+            stopped_by = evaluate_run(path, job, console)
+            if stopped_by:
+                return stopped_by
     return None
+
+
+def wait_for_others(begun: list[Path], console: Console) -> None:
+    """Until nobody writes these runs: whoever was told to stop, or lost its parent, ends its cycle.
+
+    In pretraining that can take minutes.
+    """
+    while True:
+        try:
+            with writing(begun, PATIENCE):
+                return
+        except UserError as error:
+            console.print(f"waiting: {error}", highlight=False, soft_wrap=True, markup=False)
 
 
 def together(paths: list[Path]) -> list[list[Path]]:
@@ -60,11 +74,23 @@ def together(paths: list[Path]) -> list[list[Path]]:
     return [[path] for path in paths]
 
 
-def evaluate_run(path: Path, episodes: int, num_workers: int | None) -> None:
-    """Play greedy episodes with a run's newest policy, and keep what each of them earned."""
+def evaluate_run(path: Path, job: Job, console: Console) -> signal.Signals | None:
+    """Play greedy episodes with a run's newest policy, and keep what each of them earned.
+
+    Where its last checkpoint is damaged, the run is finished again before.
+    """
     loaded = load_run(path, trust=True)
-    key = jax.random.key(EVALUATION_SEED)
-    results = evaluate(loaded.env, loaded.executor, key, episodes, num_workers)
+    if loaded.step < job.config.total_steps:
+        outcome = resume(path, job.config.total_steps, trust=True, console=console)
+        if outcome.stopped_by:
+            return outcome.stopped_by
+        loaded = load_run(path, trust=True)
+    config, key = job.config, jax.random.key(EVALUATION_SEED)
+    results = evaluate(
+        *(loaded.env, loaded.executor, key, job.eval_episodes),
+        config.num_workers,
+        config.worker_timeout,
+    )
     numbers = {
         "step": loaded.step,
         "greedy": True,
@@ -74,6 +100,8 @@ def evaluate_run(path: Path, episodes: int, num_workers: int | None) -> None:
         "episode_length": results.length.tolist(),
     }
     replace_file(path / EVALUATION, json.dumps(numbers) + "\n")
+    console.print(f"evaluated {path}", highlight=False, soft_wrap=True, markup=False)
+    return None
 
 
 def stop_with_parent() -> None:

@@ -108,7 +108,7 @@ class Checkpoints:
         return step, tree
 
     def forget_after(self, step: int) -> None:
-        """Remove damaged checkpoints past `step`: the run will produce them again."""
+        """Remove what is past `step`, as it is not whole: the run will produce it again."""
         for later in self.steps:
             if later > step:
                 shutil.rmtree(self.at(later))

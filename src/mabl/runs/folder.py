@@ -22,7 +22,7 @@ import yaml
 
 from mabl import plain_yaml
 from mabl.algorithms.config import Config, from_dict
-from mabl.algorithms.registry import unread
+from mabl.algorithms.registry import ALGORITHMS, unread
 from mabl.envs.registry import names_code
 from mabl.errors import UserError
 from mabl.runs.files import check_plain, replace_file
@@ -37,8 +37,10 @@ RECORDED_PACKAGES = ("mabl", "jax", "jaxlib", "equinox", "optax", "jaxmarl")
 def create(config: Config, seed: int) -> Path:
     """Make the folder of one seed's run and write its config and versions.
 
-    Raises UserError where it cannot be written.
+    Raises UserError where it cannot be written, and for a label that is another algorithm's name.
     """
+    if config.label in ALGORITHMS and config.label != config.algo:
+        raise UserError(f"--label {config.label} is an algorithm, but not {config.algo}: change it")
     devices = config.num_devices // gcd(config.num_devices, config.num_seeds)  # of one seed
     config = replace(config, seed=seed, num_seeds=1, num_devices=devices)
     parent = Path(config.logdir) / config.env / config.name / f"seed_{seed}"

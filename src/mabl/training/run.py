@@ -33,6 +33,9 @@ from mabl.training.progress import Progress, duration
 CURVES_EVERY = 30.0
 """Seconds between refreshes of curves.png."""
 
+PLACEMENT = ("logdir", "num_devices", "workers", "num_workers", "worker_timeout")
+"""Fields that say where a run is computed, and nothing of what."""
+
 SUMS = ("episodes/", "rows/")
 """What a cycle tells of itself, and no row of metrics repeats."""
 
@@ -87,6 +90,10 @@ def resume(
         if shared_steps(checkpoints):
             step, restored = restore(checkpoints, "state", shape)
             states = jax.tree.map(lambda *x: jnp.stack(x), *restored)
+        elif any(kept.steps for kept in checkpoints) and len(folders) > 1:
+            raise UserError(
+                "these runs have no checkpoint of the same step in common: resume them one by one"
+            )
         else:
             step, keys = -1, jnp.stack([jax.random.key(config.seed) for config in configs])
             states = programs(config).init(keys)
@@ -102,9 +109,10 @@ def resume(
 
 
 def check_alike(folders: Sequence[Path], configs: Sequence[Config]) -> None:
-    """Raise UserError unless runs differ in their seeds alone."""
+    """Raise UserError unless runs differ alone in their seeds, and where they are computed."""
     for path, config in zip(folders[1:], configs[1:], strict=True):
-        if replace(config, seed=configs[0].seed) != configs[0]:
+        same = {name: getattr(configs[0], name) for name in ("seed", *PLACEMENT)}
+        if replace(config, **same) != configs[0]:
             raise UserError(f"{path} has another config than {folders[0]}: resume it on its own")
     if len({config.seed for config in configs}) < len(configs):
         raise UserError("two of the runs have the same seed: resume them one by one")
