@@ -17,6 +17,7 @@ from PIL import Image
 
 from mabl import Policy, TeamPolicy, UserError, cli
 from mabl.envs.coordination import CoordinationEnv
+from mabl.errors import PREEMPTED
 from mabl.runs import folder as run_folder
 from mabl.runs.checkpoint import Checkpoints
 
@@ -268,7 +269,7 @@ def test_a_run_folder_holds_what_the_documentation_says(trained):
 
 
 @pytest.mark.parametrize(
-    ("number", "expected"), [(signal.SIGINT, cli.INTERRUPTED), (signal.SIGTERM, cli.PREEMPTED)]
+    ("number", "expected"), [(signal.SIGINT, cli.INTERRUPTED), (signal.SIGTERM, PREEMPTED)]
 )
 def test_a_signal_saves_and_the_run_can_be_resumed(mabl, tmp_path, number, expected):
     logdir = tmp_path / "runs"

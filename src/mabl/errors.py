@@ -16,6 +16,10 @@ UNWRITABLE = (
 """A user's to mend: no permission, a file system for reading only, a full disk, a limit reached."""
 
 
+PREEMPTED = 75
+"""Exit code of a run or a job that was told to stop, all being saved: `EX_TEMPFAIL`."""
+
+
 class UserError(Exception):
     """A mistake the user can mend, said in one line: what came, what was expected, what to do."""
 

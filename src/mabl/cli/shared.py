@@ -11,14 +11,13 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from mabl.errors import PREEMPTED
+
 PIPED_WIDTH = 160
 """Columns of a table that goes to a file or another program."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""
-
-PREEMPTED = 75
-"""Exit code after SIGTERM, all being saved: `EX_TEMPFAIL`, go on with `mabl resume`."""
 
 EXIT_CODES = {None: 0, signal.SIGINT: INTERRUPTED, signal.SIGTERM: PREEMPTED}
 """Of a run, by what ended it early."""

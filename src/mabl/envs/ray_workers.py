@@ -2,6 +2,7 @@
 
 import logging
 import os
+import socket
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
@@ -10,6 +11,9 @@ from mabl.envs.host import Hosted
 from mabl.envs.pool import Answer, Bench, Lost, Slots, WorkerDied, empty_slots, map_slots
 from mabl.errors import UserError
 from mabl.rows import TimeStep
+
+PROBED_FOR = 10.0
+"""Seconds in which a cluster must answer."""
 
 
 def join_cluster(address: str | None = None) -> int:
@@ -27,14 +31,23 @@ def join_cluster(address: str | None = None) -> int:
         raise UserError("Ray needs an extra: pip install 'mabl[ray]'") from error
     if not ray.is_initialized():
         try:
+            probe(address or os.environ.get("RAY_ADDRESS", ""))
             ray.init(address, log_to_driver=False, logging_level=logging.WARNING)
-        except (ConnectionError, RuntimeError, ValueError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             where = address or os.environ.get("RAY_ADDRESS", "this machine")
             raise UserError(
                 f"no Ray cluster at {where} ({error}): start it, give its address as HOST:PORT, or "
                 "none to use this machine"
             ) from error
     return max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+
+def probe(address: str) -> None:
+    """Raise OSError if nobody listens at HOST:PORT: Ray would wait for minutes."""
+    host, _, port = address.rpartition(":")
+    if host and "/" not in host and port.isdigit():
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=PROBED_FOR):
+            pass
 
 
 class RayWorker:

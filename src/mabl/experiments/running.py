@@ -12,6 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
+from mabl.errors import PREEMPTED
 from mabl.experiments.board import Board
 from mabl.experiments.jobs import Job
 from mabl.experiments.processes import Backend
@@ -21,9 +22,6 @@ POLL_EVERY = 0.5
 
 LOG_TAIL = 4_000
 """Characters of a log in which the reason of a failure is looked for."""
-
-PREEMPTED = 75
-"""Exit code of a job that was told to stop."""
 
 
 @dataclass
