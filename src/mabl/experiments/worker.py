@@ -79,9 +79,9 @@ def evaluate_run(path: Path, job: Job, console: Console) -> signal.Signals | Non
 
     Where its last checkpoint is damaged, the run is finished again before.
     """
-    loaded = load_run(path, trust=True)
-    if loaded.step < job.config.total_steps:
-        outcome = resume(path, job.config.total_steps, trust=True, console=console)
+    loaded, wanted = load_run(path, trust=True), max(job.config.total_steps, steps_done(path))
+    if loaded.step < wanted:
+        outcome = resume(path, wanted, trust=True, console=console)
         if outcome.stopped_by:
             return outcome.stopped_by
         loaded = load_run(path, trust=True)
