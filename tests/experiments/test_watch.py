@@ -11,7 +11,6 @@ import time
 import urllib.error
 import urllib.request
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -22,8 +21,10 @@ from tests.experiments.runs import configured, make_run
 
 from mabl.errors import UserError
 from mabl.experiments import watch
+from mabl.experiments.filming import film_at, films
+from mabl.experiments.following import Follower
 from mabl.experiments.jobs import Job
-from mabl.experiments.watch import Follower, Watch, film_at, films, panels, serve, thin
+from mabl.experiments.watch import Watch, panels, serve, thin
 
 
 def line(step, **metrics):
@@ -289,9 +290,6 @@ def starting(logdir):
 
     What it takes for Python, to film with, says how it was called, and fails.
     """
-    if not find_spec("nicegui"):
-        yield None
-        return
     port, play = free_port(), logdir.parent / "play"
     play.write_text('#!/bin/sh\nsleep 2\necho working\necho "$JAX_PLATFORMS $(nice) $@"\nexit 2\n')
     play.chmod(0o755)
@@ -310,8 +308,6 @@ def starting(logdir):
 @pytest.fixture(scope="module")
 def server(starting):
     """The page's address; Ctrl-C ends it quietly."""
-    if starting is None:
-        pytest.skip("NiceGUI is not installed")
     process, address = starting
     for _ in range(300):
         if process.poll() is not None or answer(address) == 200:

@@ -177,9 +177,9 @@ def mean_between(record: Record, values: NDArray[np.floating], start: float, end
 def newest(record: Record, values: NDArray[np.floating], last: float, end: float) -> float:
     """Mean over the training episodes of the last steps; of the last cycle before in which any
     ended, where none ended in them."""
-    known = np.flatnonzero((record.steps <= end) & ~np.isnan(values))
+    cycles = np.flatnonzero((record.steps <= end) & ~np.isnan(values))
     found = mean_between(record, values, end - last, end)
-    return float(values[known[-1]]) if np.isnan(found) and len(known) else found
+    return float(values[cycles[-1]]) if np.isnan(found) and len(cycles) else found
 
 
 def curve(record: Record, grid: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -240,31 +240,6 @@ def thin(steps: Sequence[float], values: Sequence[float]) -> list[tuple[float, f
     return points[::stride] + (points[-1:] if (len(points) - 1) % stride else [])
 
 
-def films(run: Path) -> list[Path]:
-    """Of a run's episodes, the newest first; links are left out."""
-    folder = run / "videos"
-    found = []
-    try:
-        for path in () if folder.is_symlink() else folder.iterdir():
-            whole = path.suffix in (".gif", ".mp4") and not path.name.startswith("unfinished-")
-            if whole and path.is_file() and not path.is_symlink():
-                found.append((path.stat().st_mtime, path))
-    except OSError:  # there is none, or it was replaced meanwhile
-        pass
-    return [path for _, path in sorted(found, reverse=True)]
-
-
-def film_at(logdir: Path, where: str) -> Path | None:
-    """The film at a path below a folder that is no link itself; None for any other file."""
-    path = logdir / where
-    try:
-        inside = path.is_relative_to(logdir) and path.resolve() == path
-    except (ValueError, OSError):
-        return None
-    run = path.parent.parent
-    return path if inside and (run / "config.yaml").is_file() and path in films(run) else None
-
-
 def serve(logdir: Path, port: int = 8642, show: bool = True) -> None:
     """Show the runs below a folder on a page of this machine until Ctrl-C.
 

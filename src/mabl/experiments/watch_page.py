@@ -5,9 +5,6 @@ Whoever opens it has a `Page`, which reads the folders every few seconds; all sh
 
 import asyncio
 import math
-import os
-import sys
-from asyncio.subprocess import DEVNULL, PIPE, STDOUT, Process
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -20,7 +17,8 @@ from nicegui import run as nicegui_run
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.responses import FileResponse, Response
 
-from mabl.experiments.watch import HOST, Line, Standing, Watch, film_at, films
+from mabl.experiments.filming import Studio, film_at, films
+from mabl.experiments.watch import HOST, Line, Standing, Watch
 from mabl.training.curves import PANELS
 from mabl.training.progress import duration
 
@@ -44,9 +42,6 @@ COLOURS = (
 
 DASHES = ("solid", "dashed", "dotted")
 """Of the metrics in one panel."""
-
-NICENESS = 10
-"""Films leave the processors to what is trained."""
 
 STATES = {"running": "primary", "finished": "positive", "failed": "negative"}
 """Colours of their bars; what is stopped or damaged is grey."""
@@ -85,45 +80,6 @@ CHOOSE = """
   <q-icon name="show_chart" :style="{ color: props.row.ink }" />
 </div>
 """
-
-
-class Studio:
-    """Films episodes with `mabl play`, one at a time."""
-
-    def __init__(self) -> None:
-        self.filming: Path | None = None
-        self.failed: dict[Path, str] = {}
-        """What it last said of runs that it could not film."""
-        self._process: Process | None = None
-
-    async def film(self, run: Path) -> None:
-        """Film an episode of a run, unless something is being filmed."""
-        if self.filming:
-            return
-        self.filming = run
-        self.failed.pop(run, None)
-        try:
-            self._process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "mabl", "play", str(run), "--episodes", "1"),
-                stdin=DEVNULL,
-                stdout=PIPE,
-                stderr=STDOUT,
-                env=os.environ | {"JAX_PLATFORMS": "cpu"},  # accelerators are for training
-            )
-            with suppress(ProcessLookupError):  # it has ended already
-                os.setpriority(os.PRIO_PROCESS, self._process.pid, os.nice(0) + NICENESS)
-            said, _ = await self._process.communicate()
-            if self._process.returncode:
-                lines = said.decode(errors="replace").strip().splitlines()
-                self.failed[run] = lines[-1] if lines else f"exit code {self._process.returncode}"
-        finally:
-            self.filming = self._process = None
-
-    def close(self) -> None:
-        """Leave a film that is being made."""
-        if self._process:
-            with suppress(ProcessLookupError):
-                self._process.terminate()
 
 
 class Page:
@@ -295,16 +251,16 @@ def cells(run: Standing) -> dict[str, Any]:
         "done": min(run.step / total, 1.0) if total else 0.0,
         "steps": f"{run.step:,} of {total:,}" if total else "",
         "colour": STATES.get(run.state, "grey"),
-        "score": known(run.score),
-        "episode_return": known(run.episode_return),
-        "speed": known(run.speed),
+        "score": or_none(run.score),
+        "episode_return": or_none(run.episode_return),
+        "speed": or_none(run.speed),
         "left": duration(run.seconds_left) if math.isfinite(run.seconds_left) else "",
         "begun": run.folder.name if total and run.folder.parent.name.startswith("seed_") else "",
         "note": run.note,
     }
 
 
-def known(value: float) -> float | None:
+def or_none(value: float) -> float | None:
     """None if it is not."""
     return value if math.isfinite(value) else None
 
