@@ -2,12 +2,10 @@
 
 import re
 import signal
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from rich.console import Console
@@ -16,6 +14,7 @@ from mabl.errors import PREEMPTED
 from mabl.experiments.board import Board
 from mabl.experiments.jobs import Job
 from mabl.experiments.processes import Backend
+from mabl.training.interruption import Interruption
 
 POLL_EVERY = 0.5
 """Seconds between looks at what ended."""
@@ -61,7 +60,7 @@ class Running:
         self._jobs: list[Job] = []
         self._backend = backend
         self._board = Board(console, self._jobs, self.tally)
-        self._stop = _Stop(backend, console)
+        self._stop = Interruption(console, "stopping: jobs save and end", backend.stop)
 
     def __enter__(self) -> "Running":
         self._stop.__enter__()
@@ -151,33 +150,3 @@ def last_words(log: Path) -> str:
     lines = log.read_text(errors="replace")[-LOG_TAIL:].splitlines()
     said = [line.strip() for line in lines if line.strip()]
     return re.sub(r"^mabl: ", "", said[-1])[:300] if said else ""
-
-
-class _Stop:
-    """The first Ctrl-C or SIGTERM has jobs save and end; the second is real."""
-
-    received: signal.Signals | None = None
-
-    def __init__(self, backend: Backend, console: Console):
-        self._backend, self._console = backend, console
-        self._previous: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> "_Stop":
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
-        return self
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        del frame
-        self.received = signal.Signals(number)
-        self._console.print("stopping: jobs save and end; once more stops at once")
-        self._restore()
-        self._backend.stop()
-
-    def _restore(self) -> None:
-        while self._previous:
-            signal.signal(*self._previous.popitem())
-
-    def __exit__(self, *_: object) -> None:
-        self._restore()

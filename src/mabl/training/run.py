@@ -1,14 +1,10 @@
 """A training run from start to finish: folders, progress, metrics, checkpoints, interruption."""
 
 import signal
-import threading
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +21,7 @@ from mabl.runs.lock import writing
 from mabl.runs.metrics import MetricsLog, Row, read
 from mabl.training import curves
 from mabl.training.faults import check_finite, disks_explained
+from mabl.training.interruption import Interruption
 from mabl.training.loop import Training, TrainState
 from mabl.training.memory import check_memory, free_memory
 from mabl.training.programs import grid_of, programs
@@ -166,7 +163,7 @@ def _run(
     with (
         disks_explained(checkpoints),
         run.open_cycle(config) as cycle,
-        _Interruption(console) as interruption,
+        Interruption(console, "stopping after this cycle") as interruption,
         Progress(console, total_steps, training.env.spec.score_name) as progress,
     ):
         while step < total_steps and not interruption.received:
@@ -275,35 +272,3 @@ def draw_curves(folders: list[Path], config: Config) -> None:
     """Refresh curves.png of every seed."""
     for path in folders:
         curves.draw(read(path), f"{config.name} on {config.env}", path / "curves.png")
-
-
-class _Interruption:
-    """Turns the first Ctrl-C or SIGTERM into a wish to stop after the cycle; the second is real."""
-
-    received: signal.Signals | None = None
-    """What the wish came as."""
-
-    def __init__(self, console: Console):
-        self._console = console
-        self._previous: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> "_Interruption":
-        if threading.current_thread() is threading.main_thread():  # the only one that may
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._handle)
-        return self
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        del frame
-        self.received = signal.Signals(number)
-        again = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
-        with suppress(OSError):  # a terminal that is gone
-            self._console.print(f"stopping after this cycle; {again} again stops at once")
-        self._restore()
-
-    def _restore(self) -> None:
-        while self._previous:
-            signal.signal(*self._previous.popitem())
-
-    def __exit__(self, *_: object) -> None:
-        self._restore()
