@@ -96,7 +96,7 @@ class Job:
         return all(
             path is not None
             and steps_done(path) >= self.config.total_steps
-            and evaluated_at(path) == steps_done(path)
+            and is_evaluated(path, self.eval_episodes)
             for path in self.runs().values()
         )
 
@@ -166,13 +166,14 @@ def steps_done(run: Path) -> int:
     return max(Checkpoints(folder).steps, default=-1) if folder.is_dir() else -1
 
 
-def evaluated_at(run: Path) -> int | None:
-    """Steps of the policy that was evaluated, if one was."""
+def is_evaluated(run: Path, episodes: int) -> bool:
+    """Whether its newest policy has played so many episodes, or more."""
     path = run / EVALUATION
     try:
-        return json.loads(path.read_text())["step"] if path.exists() else None
+        played = json.loads(path.read_text()) if path.exists() else {}
+        return played["step"] == steps_done(run) and len(played["episode_return"]) >= episodes
     except (ValueError, KeyError, TypeError):
-        return None
+        return False
 
 
 def plain(data: Any) -> Any:

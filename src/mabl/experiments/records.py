@@ -14,14 +14,7 @@ from safetensors import SafetensorError, safe_open
 from mabl import plain_yaml
 from mabl.algorithms.config import Config
 from mabl.errors import UserError
-from mabl.experiments.jobs import (
-    EVALUATION,
-    Job,
-    comparable,
-    evaluated_at,
-    read_job,
-    steps_done,
-)
+from mabl.experiments.jobs import EVALUATION, Job, comparable, read_job, steps_done
 from mabl.runs.checkpoint import Checkpoints
 from mabl.runs.folder import read_config
 from mabl.runs.metrics import read, score_name
@@ -188,10 +181,12 @@ def read_record(folder: Path, config: Config | None = None) -> Record | int:
 
     versions = folder / "versions.yaml"
     evaluation = folder / EVALUATION
-    played = json.loads(evaluation.read_text()) if evaluated_at(folder) is not None else None
+    played = json.loads(evaluation.read_text()) if evaluation.exists() else None
     if played is not None:
         for name in (score, "episode_return"):
             np.array(played[name], float)
+        if played["step"] != steps_done(folder):
+            played = None
     return Record(
         folder=folder,
         config=config or read_config(folder, trust=True),
@@ -204,7 +199,7 @@ def read_record(folder: Path, config: Config | None = None) -> Record | int:
         seconds=sum(row.get("time/seconds", 0.0) for row in rows),
         imagined=sum(row.get("train/imagined_steps", 0.0) for row in rows),
         parameters=count_parameters(folder),
-        evaluation=played if evaluated_at(folder) == steps_done(folder) else None,
+        evaluation=played,
         versions=dict(plain_yaml.load(versions.read_text())) if versions.exists() else {},
     )
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from mabl.errors import UserError
 from mabl.evaluation import evaluate
-from mabl.experiments.jobs import EVALUATION, Job, evaluated_at, in_a_row, steps_done
+from mabl.experiments.jobs import EVALUATION, Job, in_a_row, is_evaluated, steps_done
 from mabl.policy import load_run
 from mabl.runs.checkpoint import Checkpoints, shared_steps
 from mabl.runs.files import replace_file
@@ -43,7 +43,7 @@ def work(job: Job, console: Console) -> signal.Signals | None:
         if outcome.stopped_by:
             return outcome.stopped_by
     for path in job.runs().values():
-        if path is not None and evaluated_at(path) != steps_done(path):
+        if path is not None and not is_evaluated(path, job.eval_episodes):
             stopped_by = evaluate_run(path, job, console)
             if stopped_by:
                 return stopped_by
