@@ -2,6 +2,7 @@
 
 import json
 import signal
+from dataclasses import replace
 
 import pytest
 from tests.experiments.tiny_suite import (
@@ -44,7 +45,7 @@ def test_every_seed_is_trained_and_evaluated(undisturbed):
     assert "1 done" in said(undisturbed) and "next: mabl report" in said(undisturbed)
 
 
-def test_what_is_done_is_kept(undisturbed, suite):
+def test_what_is_done_is_kept(undisturbed, suite, mabl):
     before = [
         run.stat().st_mtime_ns for seed in (0, 1) for run in runs_of(undisturbed, "mappo", seed)
     ]
@@ -54,6 +55,8 @@ def test_what_is_done_is_kept(undisturbed, suite):
         run.stat().st_mtime_ns for seed in (0, 1) for run in runs_of(undisturbed, "mappo", seed)
     ]
     assert before == after
+    jobs = mabl("suite", "jobs", suite, f"--logdir={undisturbed}", "--total-steps=1000")
+    assert jobs == (0, "", "")
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
@@ -108,6 +111,15 @@ def test_one_job_can_be_run_by_hand(undisturbed, mabl):
     (file,) = (undisturbed / "tiny" / "jobs").glob("*seeds-0-1.yaml")
     assert read_job(file).is_done()
     assert mabl("job", file)[0] == 0
+
+
+def test_more_episodes_are_played_where_more_are_asked_for(undisturbed, mabl):
+    (file,) = (undisturbed / "tiny" / "jobs").glob("*seeds-0-1.yaml")
+    job = replace(read_job(file), eval_episodes=6)
+    assert not job.is_done()
+    job.write()
+    assert mabl("job", file)[0] == 0
+    assert job.is_done() and replace(job, eval_episodes=4).is_done()
 
 
 def test_a_job_that_a_signal_kills_is_shown_and_goes_on_next_time(undisturbed):

@@ -166,3 +166,16 @@ def test_suites_are_listed(capsys):
     assert cli.run(["suite", "list"]) == 0
     said = capsys.readouterr().out
     assert all(name in said for name in ("paper-table1", "paper-ablation", "smax", "quick"))
+
+
+def test_jobs_are_written_for_other_schedulers(capsys, tmp_path):
+    run = ["suite", "jobs", "quick", f"--logdir={tmp_path}", "--total-steps=100", "--num-seeds=2"]
+    assert cli.run([*run, "--algorithms", "mabl", "mappo"]) == 0
+    jobs = [read_job(Path(line)) for line in capsys.readouterr().out.splitlines()]
+    assert [(job.config.env, job.config.algo) for job in jobs] == [
+        ("smax/3m", "mabl"),
+        ("smax/3m", "mappo"),
+        ("test/coordination", "mabl"),
+        ("test/coordination", "mappo"),
+    ]
+    assert {job.seeds for job in jobs} == {(0, 1)} and jobs[0].config.total_steps == 100

@@ -17,15 +17,11 @@ from mabl.parsing import parse
 
 
 @dataclass(frozen=True)
-class SuiteArguments:
-    """Run a suite: its algorithms on its tasks, with all its seeds. What is done is kept."""
+class JobsArguments:
+    """Write the jobs of a suite that are left to do, for other schedulers: paths, one in a line."""
 
     suite: tyro.conf.Positional[str]
     """A name of `mabl suite list`, or a file of your own: suite.yaml."""
-    backend: Literal["local", "ray"] = "local"
-    """Where jobs run: on this machine's cores, or on a Ray cluster."""
-    address: str | None = None
-    """The Ray cluster: HOST:PORT, or auto; default: RAY_ADDRESS, or this machine."""
     logdir: Path = Path("runs")
     """Run folders go to LOGDIR/SUITE."""
     num_seeds: int | None = None
@@ -40,25 +36,70 @@ class SuiteArguments:
     """Cores of one job; default: the suite's."""
     gpus: float | None = None
     """GPUs of one job, with Ray; a fraction lets jobs share one; default: the suite's."""
+
+
+@dataclass(frozen=True)
+class SuiteArguments(JobsArguments):
+    """Run a suite: its algorithms on its tasks, with all its seeds. What is done is kept."""
+
+    backend: Literal["local", "ray"] = "local"
+    """Where jobs run: on this machine's cores, or on a Ray cluster."""
+    address: str | None = None
+    """The Ray cluster: HOST:PORT, or auto; default: RAY_ADDRESS, or this machine."""
     parallel: int | None = None
     """Jobs at once on this machine; default: as many as it has cores for."""
     retry: bool = False
     """Try again what failed before."""
 
 
+SUITE_VERBS = """usage: mabl suite run SUITE [--help]
+       mabl suite jobs SUITE [--help]
+       mabl suite list"""
+
+
 def suite(arguments: list[str]) -> int:
-    """Compare algorithms on tasks: suite run SUITE, suite list."""
-    if arguments[:1] == ["list"]:
-        parse(lambda: None, arguments[1:], "mabl suite list", description="List suites.")
-        return list_suites()
-    if arguments[:1] != ["run"]:
-        if arguments[:1] in (["-h"], ["--help"]):
-            print("usage: mabl suite run SUITE [--help]\n       mabl suite list")
+    """Compare algorithms on tasks: suite run SUITE, suite jobs SUITE, suite list."""
+    match arguments:
+        case ["run", *rest]:
+            return run_suite(parse(SuiteArguments, rest, "mabl suite run"))
+        case ["jobs", *rest]:
+            return write_jobs(parse(JobsArguments, rest, "mabl suite jobs"))
+        case ["list", *rest]:
+            parse(lambda: None, rest, "mabl suite list", description="List suites.")
+            return list_suites()
+        case ["-h" | "--help", *_]:
+            print(SUITE_VERBS)
             return 0
-        raise UserError("mabl suite needs a verb: give mabl suite run SUITE, or mabl suite list")
-    given = parse(SuiteArguments, arguments[1:], "mabl suite run")
-    from mabl.experiments.jobs import jobs_of
+    raise UserError("mabl suite needs a verb: give mabl suite run SUITE, or mabl suite list")
+
+
+def run_suite(given: SuiteArguments) -> int:
+    """Run what is not done of a suite."""
     from mabl.experiments.running import run_jobs
+
+    chosen, jobs = chosen_jobs(given)
+    console = Console(stderr=True)
+    tally = run_jobs(jobs, backend_of(given, chosen.cpus), console, given.retry)
+    console.print(tally.says(), highlight=False)
+    console.print(
+        f"next: mabl report {given.logdir / chosen.name}", highlight=False, soft_wrap=True
+    )
+    if tally.stopped_by:
+        return EXIT_CODES[tally.stopped_by]
+    return int(bool(tally.failed or tally.broken))
+
+
+def write_jobs(given: JobsArguments) -> int:
+    """Write the files of what is not done of a suite, and print their paths."""
+    for job in chosen_jobs(given)[1]:
+        if not job.is_done():
+            print(job.write())
+    return 0
+
+
+def chosen_jobs(given: JobsArguments) -> tuple[Any, list[Any]]:
+    """The part of a suite that is asked for, and its jobs. Raises UserError if there is none."""
+    from mabl.experiments.jobs import jobs_of
     from mabl.experiments.suite import load, narrowed
 
     for name in ("num_seeds", "total_steps"):
@@ -66,15 +107,7 @@ def suite(arguments: list[str]) -> int:
     chosen = narrowed(load(given.suite), given.tasks, given.algorithms)
     told = {"seeds": given.num_seeds, "cpus": given.cpus, "gpus": given.gpus}
     chosen = replace(chosen, **{name: new for name, new in told.items() if new is not None})
-    logdir = given.logdir / chosen.name
-    jobs = jobs_of(chosen, logdir, given.total_steps)
-    console = Console(stderr=True)
-    tally = run_jobs(jobs, backend_of(given, chosen.cpus), console, given.retry)
-    console.print(tally.says(), highlight=False)
-    console.print(f"next: mabl report {logdir}", highlight=False, soft_wrap=True)
-    if tally.stopped_by:
-        return EXIT_CODES[tally.stopped_by]
-    return int(bool(tally.failed or tally.broken))
+    return chosen, jobs_of(chosen, given.logdir / chosen.name, given.total_steps)
 
 
 def backend_of(given: Any, cpus: float) -> Any:
