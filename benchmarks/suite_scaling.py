@@ -1,9 +1,9 @@
 """How a suite's time shrinks with nodes: local Ray nodes of one core each.
 
-    uv run python -m benchmarks.suite_scaling --suite quick --total-steps 3000 --nodes 1 2
+    uv run python -m benchmarks.suite_scaling --suite quick --total-steps 3000 --nodes 2 1 2
 
-Each number of nodes runs the whole suite anew; compiled programs come from the cache, so run it
-once before. Efficiency is the time on one node over n times the time on n. Each job takes one core,
+Each number of nodes runs the whole suite anew; compiled programs come from the cache, which the first
+of them fills. Efficiency is the time on one node over n times the time on n. Each job takes one core,
 whatever the machine has.
 """
 
