@@ -2,7 +2,6 @@
 
 import signal
 import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from types import FrameType
@@ -10,12 +9,12 @@ from typing import Any
 
 from rich.console import Console
 
-GRACE = 2.0
-"""Seconds after a SIGTERM in which others say the same: schedulers tell a process and its group."""
-
 
 class Interruption:
-    """Turns the first Ctrl-C or SIGTERM into a wish to stop; the second is real."""
+    """Turns the first Ctrl-C or SIGTERM into a wish to stop; Ctrl-C after it is real.
+
+    SIGTERM after it says nothing new: schedulers tell a process, its group, and its parent.
+    """
 
     received: signal.Signals | None = None
     """What the wish came as."""
@@ -24,7 +23,6 @@ class Interruption:
         """On a wish, `words` say what happens now, and `obey` is called."""
         self._console, self._words, self._obey = console, words, obey
         self._previous: dict[signal.Signals, Any] = {}
-        self._when = 0.0
 
     def __enter__(self) -> "Interruption":
         if threading.current_thread() is threading.main_thread():  # the only one that may
@@ -35,14 +33,14 @@ class Interruption:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
         if self.received:
-            if number == signal.SIGINT or time.monotonic() > self._when + GRACE:
+            if number == signal.SIGINT:
                 self._restore()
                 signal.raise_signal(number)
             return
-        self.received, self._when = signal.Signals(number), time.monotonic()
-        again = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
+        self.received = signal.Signals(number)
+        again = "Ctrl-C again" if number == signal.SIGINT else "Ctrl-C or SIGKILL"
         with suppress(OSError):  # a terminal that is gone
-            self._console.print(f"{self._words}; {again} again stops at once")
+            self._console.print(f"{self._words}; {again} stops at once")
         self._obey()
 
     def _restore(self) -> None:
