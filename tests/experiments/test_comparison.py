@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from tests.experiments.runs import make_comparison, make_run
+from tests.experiments.runs import configured, make_comparison, make_run
 
 from mabl import UserError
 from mabl.experiments.comparison import POINTS, SMOOTHING, Comparison, mean_between
+from mabl.experiments.jobs import Job
 from mabl.experiments.records import collect, read_record
 from mabl.experiments.tables import final_scores, in_steps, tables
 
@@ -182,6 +183,31 @@ def test_a_spoilt_run_is_named_and_the_others_are_compared(name, tmp_path):
     comparison = compare(tmp_path)
     assert len(comparison.unread) == 1
     assert comparison.tasks[0].groups["mabl"].final == pytest.approx([0.2])
+
+
+def test_a_job_of_before_does_not_speak_for_newer_runs(tmp_path):
+    """However many seeds it had, and whatever its file is called."""
+    old = make_run(tmp_path, [0.1] * 20)
+    for path, seeds in ((old, 5), (make_run(tmp_path, [0.9] * 20, precision="float32"), 2)):
+        Job(configured(path), tuple(range(seeds)), eval_episodes=4).write()
+    comparison = compare(tmp_path)
+    assert comparison.superseded == 1
+    assert comparison.tasks[0].groups["mabl"].final == pytest.approx([0.9])
+    assert [(gap.seed, gap.reason) for gap in comparison.missing] == [(1, "not begun")]
+
+
+def test_a_run_without_an_episode_up_to_the_common_end_is_missing(tmp_path):
+    """It would be nowhere in curves, and no number at the end."""
+    make_run(tmp_path, [0.1] * 2)
+    path = make_run(tmp_path, [0.9] * 5, "mappo")
+    rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    for row in rows[:3]:
+        row["train/episodes"] = 0.0
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    comparison = compare(tmp_path)
+    assert comparison.algorithms == comparison.everywhere == ["mabl"]
+    (gap,) = comparison.missing
+    assert gap[:3] == ("smax/3m", "mappo", 0) and "no episode ended by step 2,000" in gap.reason
 
 
 def test_what_is_no_job_is_named(tmp_path):

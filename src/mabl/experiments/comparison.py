@@ -107,14 +107,14 @@ class Comparison:
     """Everything that a report says."""
 
     def __init__(self, found: Found):
-        self.records, self.superseded = found.records, found.superseded
-        self.missing: list[Missing] = found.missing
-        self.unread = found.unread
-        names = {record.config.name for record in found.records}
+        self.superseded, self.unread = found.superseded, found.unread
+        self.records, without = begun(found.records)
+        self.missing: list[Missing] = [*found.missing, *without]
+        names = {record.config.name for record in self.records}
         known = [name for name in ALGORITHMS if name in names]
         self.algorithms = [*known, *sorted(names - set(known))]
         by_task: dict[str, list[Record]] = {}
-        for record in sorted(found.records, key=lambda record: record.key):
+        for record in sorted(self.records, key=lambda record: record.key):
             by_task.setdefault(record.key[0], []).append(record)
         self.tasks = [Task(name, records, self.algorithms) for name, records in by_task.items()]
 
@@ -165,6 +165,23 @@ class Comparison:
             )
             for name in self.everywhere
         }
+
+
+def begun(records: Sequence[Record]) -> tuple[list[Record], list[Missing]]:
+    """Runs with an episode that ended before the shortest run of their task did, and the others."""
+    ends: dict[str, int] = {}
+    for record in records:
+        task = record.key[0]
+        ends[task] = min(ends.get(task, record.last_step), record.last_step)
+    found, without = [], []
+    for record in records:
+        end = ends[record.key[0]]
+        if (record.steps <= end).any():
+            found.append(record)
+        else:
+            why = f"no episode ended by step {end:,}, where the shortest run of the task ends"
+            without.append(Missing(*record.key, why))
+    return found, without
 
 
 def mean_between(record: Record, values: NDArray[np.floating], start: float, end: float) -> float:

@@ -89,7 +89,7 @@ def task_name(config: Config) -> str:
 def collect(paths: Sequence[Path]) -> Found:
     """All runs under some folders. Raises UserError if there are none that are finished.
 
-    The newest run of a task and an algorithm, or else the suite's job, says which settings count.
+    The newest run of a task and an algorithm says which settings count, or else the newest job.
     """
     configs: dict[Path, Config] = {}
     finished: dict[tuple[str, str, int], Record] = {}
@@ -102,9 +102,9 @@ def collect(paths: Sequence[Path]) -> Found:
         except UserError as error:
             unread.append(str(error))
             configs.pop(folder, None)
-    wanted = {(task_name(c), c.name): settings_of(c) for c in configs.values()}
     jobs = jobs_under(paths, unread)
-    wanted |= {(task_name(job.config), job.config.name): settings_of(job.config) for job, _ in jobs}
+    told = [*(job.config for job, _ in jobs), *configs.values()]
+    wanted = {(task_name(config), config.name): settings_of(config) for config in told}
     superseded = 0
     for folder, config in configs.items():
         key = task_name(config), config.name, config.seed
@@ -126,7 +126,8 @@ def collect(paths: Sequence[Path]) -> Found:
                 else f"unfinished: {done:,} of {config.total_steps:,} steps"
             )
     for job, failure in jobs:
-        for seed in job.seeds:
+        old = settings_of(job.config) != wanted[task_name(job.config), job.config.name]
+        for seed in () if old and not failure else job.seeds:
             key = task_name(job.config), job.config.name, seed
             reasons[key] = failure or reasons.get(key, "not begun")
     if not finished:
@@ -144,7 +145,12 @@ def run_folders(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             raise UserError(f"there is no folder {path}: give run folders, or folders of them")
         folders += sorted(file.parent for file in path.rglob("config.yaml"))
-    return sorted(dict.fromkeys(folders), key=lambda folder: folder.name)
+    return sorted(dict.fromkeys(folders), key=when_begun)
+
+
+def when_begun(run: Path) -> tuple[str, float]:
+    """The second that its folder is named by; within it, by its configuration's file."""
+    return run.name[: len("20261231-235959")], (run / "config.yaml").stat().st_mtime
 
 
 def settings_of(config: Config) -> Config:
@@ -153,9 +159,13 @@ def settings_of(config: Config) -> Config:
 
 
 def jobs_under(paths: Sequence[Path], unread: list[str]) -> list[tuple[Job, str]]:
-    """Jobs of suites, and why they failed, if they did. Adds to `unread` what is none."""
+    """Jobs of suites, the oldest first, and why they failed, if they did.
+
+    Adds to `unread` what is none.
+    """
     jobs = []
-    for file in sorted(file for path in paths for file in path.rglob("jobs/*.yaml")):
+    files = {file for path in paths for file in path.rglob("jobs/*.yaml")}
+    for file in sorted(files, key=lambda file: (file.stat().st_mtime, file)):
         failed = file.with_suffix(".failed")
         try:
             why = f"failed: {failed.read_text().strip()}" if failed.exists() else ""
