@@ -1,6 +1,7 @@
 """Searches: what they search, and that they go on where they were left."""
 
 import csv
+import shlex
 import signal
 import subprocess
 import sys
@@ -11,7 +12,9 @@ from tests.tiny import flags
 
 from mabl import UserError
 from mabl.algorithms.presets import preset
-from mabl.experiments.sweep import parse_space, settings
+from mabl.cli.runs import chosen_preset, parse_config
+from mabl.experiments import processes
+from mabl.experiments.sweep import flags_of, parse_space, settings
 
 optuna = pytest.importorskip("optuna")
 ENV = "test/coordination"
@@ -48,6 +51,10 @@ def test_a_search_that_is_killed_goes_on_and_the_best_is_told(tmp_path, mabl):
     study = optuna.load_study(study_name="mine", storage=f"sqlite:///{tmp_path}/mine/study.db")
     assert [trial.value for trial in study.trials] == pytest.approx(scores, abs=1e-5)
 
+    assert mabl(*command(tmp_path, 4))[0] == 0
+    rates = [row["recurrent_mappo.learning_rate"] for row in trials_of(tmp_path)]
+    assert len(rates) == len(set(rates)) == 4  # none is tried twice
+
     with pytest.raises(UserError, match="another space or config"):
         from mabl import cli
 
@@ -63,6 +70,38 @@ def test_spaces_are_intervals_logarithms_and_choices():
         "d": make.CategoricalDistribution([64, 128]),
         "e": make.FloatDistribution(0.1, 1.0),
     }
+    choices = parse_space(["mappo.ent_coef=1e-3,.1"])["mappo.ent_coef"].choices
+    config = preset("quick", "smax/3m", "mabl")
+    found = [settings(config, {"mappo.ent_coef": one}).mappo.ent_coef for one in choices]
+    assert found == [0.001, 0.1]
+
+
+def test_what_a_signal_kills_is_tried_again(tmp_path, mabl, monkeypatch):
+    """It is no failure of the settings."""
+    code, _, said = mabl(*command(tmp_path, 1), "--eval-episodes=0")
+    assert code == 2 and "give a number above 0" in said
+    whole = processes.start
+
+    def killed(job, cores=()):
+        process = whole(job, cores)
+        process.kill()
+        return process
+
+    with monkeypatch.context() as patch:
+        patch.setattr(processes, "start", killed)
+        assert mabl(*command(tmp_path, 1))[0] == 1
+    assert [row["state"] for row in trials_of(tmp_path)] == ["running"]
+    assert mabl(*command(tmp_path, 1))[0] == 0
+    assert [row["state"] for row in trials_of(tmp_path)] == ["complete"]
+
+
+def test_the_best_can_be_trained():
+    """As it is told: flags that are on or off have no value."""
+    config = preset("quick", "smax/3m", "mabl")
+    on = config.mappo.normalise_advantage
+    chosen = {"mappo.normalise_advantage": not on, "mappo.ent_coef": 0.03, "total_steps": 7}
+    default, flags = chosen_preset(shlex.split(flags_of(config, chosen)))
+    assert parse_config(flags, default) == settings(config, chosen)
 
 
 def test_settings_are_put_into_their_sections():

@@ -167,6 +167,11 @@ def brief(value: Any) -> str:
         return "too large a number"
 
 
+def is_exponent(value: Any) -> bool:
+    """Whether it is a number such as 1e-3, in which YAML wants a point."""
+    return isinstance(value, str) and re.fullmatch(r"[+-]?\d+[eE][+-]?\d+", value) is not None
+
+
 def _value(hint: Any, value: Any, path: str) -> Any:
     if is_dataclass(hint):
         return from_dict(typing.cast(type, hint), value, f"{path}.")
@@ -175,7 +180,7 @@ def _value(hint: Any, value: Any, path: str) -> Any:
         if value in typing.get_args(hint):
             return value
         raise unknown_name(path, brief(value), typing.get_args(hint))
-    if float in options and type(value) is int:
+    if float in options and (type(value) is int or is_exponent(value)):
         return float(value)
     if type(value) in options:
         return value

@@ -119,13 +119,16 @@ def open_study(search: Search) -> "Study":
     optuna = _optuna()
     try:
         search.logdir.mkdir(parents=True, exist_ok=True)
-        return optuna.create_study(
+        study = optuna.create_study(
             study_name=search.logdir.name,
             storage=search.storage or f"sqlite:///{search.logdir / 'study.db'}",
-            sampler=optuna.samplers.TPESampler(seed=search.config.seed),
             direction="maximize",
             load_if_exists=True,
         )
+        # Each time with other random numbers: those of before would propose the same again.
+        seed = search.config.seed + len(study.get_trials(deepcopy=False))
+        study.sampler = optuna.samplers.TPESampler(seed=seed)
+        return study
     except Exception as error:  # whatever the database's driver has to say
         where = search.storage or search.logdir / "study.db"
         reason = f"{error}".strip().partition("\n")[0][:200]
@@ -140,8 +143,8 @@ def tell(study: "Study", running: Running, numbers: dict[str, int]) -> None:
     for job in (*running.tally.done, *running.tally.kept):
         if job.name in numbers:
             study.tell(numbers.pop(job.name), score_of(job))
-    for name in running.tally.failed:
-        if name in numbers:
+    for name in running.tally.failed:  # what a signal killed goes on next time
+        if name in numbers and running.has_failed(name):
             study.tell(numbers.pop(name), state=states.FAIL)
 
 
@@ -176,8 +179,12 @@ def flags_of(config: Config, chosen: dict[str, Any]) -> str:
                 flags[f"{name}.{field}" if field else name] = new
     words = []
     for name, value in flags.items():
+        section, dot, field = name.replace("_", "-").rpartition(".")
+        if isinstance(value, bool):
+            words.append(f"--{section}{dot}{'' if value else 'no-'}{field}")
+            continue
         given = value if isinstance(value, tuple | list) else [value]
-        words += [f"--{name.replace('_', '-')}", *map(str, given)]
+        words += [f"--{section}{dot}{field}", *map(str, given)]
     return shlex.join(words)
 
 
