@@ -17,8 +17,11 @@ from tests.experiments.tiny_suite import (
 )
 
 from mabl import cli
+from mabl.experiments import processes
 from mabl.experiments.jobs import read_job, steps_done
+from mabl.experiments.processes import LocalBackend
 from mabl.experiments.running import Tally, conclude
+from mabl.experiments.worker import preemptible
 
 STEPS = 1_000
 
@@ -129,6 +132,33 @@ def test_a_job_that_a_signal_kills_is_shown_and_goes_on_next_time(undisturbed):
     assert "killed by SIGKILL" in tally.failed[job.name] and not job.failed.exists()
     conclude(job, -signal.SIGTERM, tally, signal.SIGTERM)
     assert tally.broken == [job]
+
+
+def test_a_job_that_is_told_to_end_where_it_has_nothing_to_save_says_so():
+    with preemptible(), pytest.raises(SystemExit) as ended:
+        signal.raise_signal(signal.SIGTERM)
+    assert ended.value.code == 75
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_nothing_is_begun_after_a_stop(undisturbed, monkeypatch):
+    """And what was being begun is told."""
+    (file,) = (undisturbed / "tiny" / "jobs").glob("*seeds-0-1.yaml")
+    backend, job = LocalBackend(1), read_job(file)
+    whole = processes.start
+
+    def start(*args):
+        process = whole(*args)
+        backend.stop()  # a signal, before the process is known
+        return process
+
+    monkeypatch.setattr(processes, "start", start)
+    backend.submit(job)
+    assert backend.running() == {job.name}
+    wait_for(lambda: backend.ended() != {})
+    backend.submit(job)
+    assert not backend.running()
+    backend.close()
 
 
 def test_a_job_whose_last_checkpoint_is_damaged_is_finished_again(undisturbed, mabl):

@@ -1,7 +1,6 @@
 """Commands of many runs: suites and their jobs, reports, searches, and a page to watch them."""
 
 import shlex
-import signal
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,8 +16,8 @@ from mabl.parsing import parse
 
 
 @dataclass(frozen=True)
-class JobsArguments:
-    """Write the jobs of a suite that are left to do, for other schedulers: paths, one in a line."""
+class Part:
+    """What of a suite is asked for."""
 
     suite: tyro.conf.Positional[str]
     """A name of `mabl suite list`, or a file of your own: suite.yaml."""
@@ -32,20 +31,28 @@ class JobsArguments:
     """Only these environments of the suite."""
     algorithms: tuple[str, ...] = ()
     """Only these algorithms of the suite, by name or label."""
-    cpus: float | None = None
-    """Cores of one job; default: the suite's."""
-    gpus: float | None = None
-    """GPUs of one job, with Ray; a fraction lets jobs share one; default: the suite's."""
 
 
 @dataclass(frozen=True)
-class SuiteArguments(JobsArguments):
+class JobsArguments:
+    """Write the jobs of a suite that are left to do, for other schedulers: paths, one in a line."""
+
+    part: tyro.conf.OmitArgPrefixes[Part]
+
+
+@dataclass(frozen=True)
+class SuiteArguments:
     """Run a suite: its algorithms on its tasks, with all its seeds. What is done is kept."""
 
+    part: tyro.conf.OmitArgPrefixes[Part]
     backend: Literal["local", "ray"] = "local"
     """Where jobs run: on this machine's cores, or on a Ray cluster."""
     address: str | None = None
     """The Ray cluster: HOST:PORT, or auto; default: RAY_ADDRESS, or this machine."""
+    cpus: float | None = None
+    """Cores of one job; default: the suite's."""
+    gpus: float | None = None
+    """GPUs of one job, with Ray; a fraction lets jobs share one; default: the suite's."""
     parallel: int | None = None
     """Jobs at once on this machine; default: as many as it has cores for."""
     retry: bool = False
@@ -77,13 +84,12 @@ def run_suite(given: SuiteArguments) -> int:
     """Run what is not done of a suite."""
     from mabl.experiments.running import run_jobs
 
-    chosen, jobs = chosen_jobs(given)
+    chosen, jobs = chosen_jobs(given.part, cpus=given.cpus, gpus=given.gpus)
     console = Console(stderr=True)
-    tally = run_jobs(jobs, backend_of(given, chosen.cpus), console, given.retry)
+    tally = run_jobs(jobs, backend_of(given, chosen.cpus, chosen.gpus), console, given.retry)
     console.print(tally.says(), highlight=False)
-    console.print(
-        f"next: mabl report {given.logdir / chosen.name}", highlight=False, soft_wrap=True
-    )
+    logdir = given.part.logdir / chosen.name
+    console.print(f"next: mabl report {logdir}", highlight=False, soft_wrap=True)
     if tally.stopped_by:
         return EXIT_CODES[tally.stopped_by]
     return int(bool(tally.failed or tally.broken))
@@ -91,26 +97,29 @@ def run_suite(given: SuiteArguments) -> int:
 
 def write_jobs(given: JobsArguments) -> int:
     """Write the files of what is not done of a suite, and print their paths."""
-    for job in chosen_jobs(given)[1]:
+    for job in chosen_jobs(given.part)[1]:
         if not job.is_done():
             print(job.write())
     return 0
 
 
-def chosen_jobs(given: JobsArguments) -> tuple[Any, list[Any]]:
-    """The part of a suite that is asked for, and its jobs. Raises UserError if there is none."""
+def chosen_jobs(part: Part, **told: float | None) -> tuple[Any, list[Any]]:
+    """A part of a suite, with fields as they are told, and its jobs.
+
+    Raises UserError if there is none.
+    """
     from mabl.experiments.jobs import jobs_of
     from mabl.experiments.suite import load, narrowed
 
     for name in ("num_seeds", "total_steps"):
-        check_above_0(given, name)
-    chosen = narrowed(load(given.suite), given.tasks, given.algorithms)
-    told = {"seeds": given.num_seeds, "cpus": given.cpus, "gpus": given.gpus}
+        check_above_0(part, name)
+    chosen = narrowed(load(part.suite), part.tasks, part.algorithms)
+    told["seeds"] = part.num_seeds
     chosen = replace(chosen, **{name: new for name, new in told.items() if new is not None})
-    return chosen, jobs_of(chosen, given.logdir / chosen.name, given.total_steps)
+    return chosen, jobs_of(chosen, part.logdir / chosen.name, part.total_steps)
 
 
-def backend_of(given: Any, cpus: float) -> Any:
+def backend_of(given: Any, cpus: float, gpus: float) -> Any:
     """Where jobs are to run. Raises UserError if they cannot."""
     check_above_0(given, "parallel")
     if given.backend == "ray":
@@ -118,7 +127,7 @@ def backend_of(given: Any, cpus: float) -> Any:
             raise UserError("--parallel is of this machine: with --backend ray give --cpus")
         from mabl.experiments.cluster import RayBackend
 
-        return RayBackend(given.address, cpus)
+        return RayBackend(given.address, cpus, gpus)
     if given.address:
         raise UserError("--address is of a Ray cluster: add --backend ray")
     from mabl.experiments.processes import LocalBackend
@@ -164,13 +173,13 @@ def job(arguments: list[str]) -> int:
     given = parse(JobArguments, arguments, "mabl job")
     from mabl.devices import use_compilation_cache
     from mabl.experiments.jobs import read_job
-    from mabl.experiments.worker import stop_with_parent, work
+    from mabl.experiments.worker import preemptible, stop_with_parent, work
 
-    if given.attached:
-        stop_with_parent()
-    use_compilation_cache()
-    stopped_by: signal.Signals | None = work(read_job(given.job), Console(stderr=True))
-    return EXIT_CODES[stopped_by]
+    with preemptible():
+        if given.attached:
+            stop_with_parent()
+        use_compilation_cache()
+        return EXIT_CODES[work(read_job(given.job), Console(stderr=True))]
 
 
 @dataclass(frozen=True)
@@ -255,7 +264,7 @@ def sweep(arguments: list[str]) -> int:
         storage=given.storage,
     )
     console = Console(stderr=True)
-    study, running = run_search(search, backend_of(given, given.cpus), console)
+    study, running = run_search(search, backend_of(given, given.cpus, given.gpus), console)
     done = [trial for trial in study.get_trials() if trial.value is not None]
     done.sort(key=lambda trial: -(trial.value or 0))
     table = Table(box=None, padding=(0, 1))

@@ -26,17 +26,29 @@ POLL_EVERY = 0.2
 class RayBackend:
     """Every job one task, with the cores and GPUs that it asks for."""
 
-    def __init__(self, address: str | None = None, cpus: float = 1):
-        """`cpus` of one job. Raises UserError without the extra, or without such a cluster."""
-        self.slots = max(1, int(join_cluster(address) // cpus))
+    def __init__(self, address: str | None = None, cpus: float = 1, gpus: float = 0):
+        """`cpus` and `gpus` of one job.
+
+        Raises UserError without the extra, or without such a cluster.
+        """
+        rooms = [join_cluster(address) // cpus]
         import ray
 
+        if gpus:
+            rooms.append(ray.cluster_resources().get("GPU", 0) // gpus)
+        self.slots = max(1, int(min(rooms)))
         self._ray: Any = ray
         self._tasks: dict[str, Any] = {}
         self._jobs: dict[str, Job] = {}
+        self._stopped = False
 
     def submit(self, job: Job) -> None:
-        """Have a job run where there is room. Raises UserError if no node has so much."""
+        """Have a job run where there is room; not after `stop`.
+
+        Raises UserError if no node has so much.
+        """
+        if self._stopped:
+            return
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         if not any(n.get("CPU", 0) >= job.cpus and n.get("GPU", 0) >= job.gpus for n in nodes):
             raise UserError(
@@ -49,6 +61,8 @@ class RayBackend:
         self._jobs[job.name] = job
         place_of(job).unlink(missing_ok=True)
         self._tasks[job.name] = task.remote(Path.cwd(), job)
+        if self._stopped:  # while it was being submitted
+            self._ray.cancel(self._tasks[job.name])
 
     def running(self) -> set[str]:
         """Names of jobs that have begun."""
@@ -74,6 +88,7 @@ class RayBackend:
 
     def stop(self) -> None:
         """Cancel all tasks: those that run have their processes save and end."""
+        self._stopped = True
         for task in self._tasks.values():
             self._ray.cancel(task)
 

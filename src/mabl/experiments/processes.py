@@ -23,7 +23,7 @@ class Backend(Protocol):
         ...
 
     def submit(self, job: Job) -> None:
-        """Have a job run when there is room."""
+        """Have a job run when there is room; not after `stop`."""
         ...
 
     def running(self) -> set[str]:
@@ -50,6 +50,7 @@ def start(job: Job, cores: Sequence[int] = ()) -> subprocess.Popen[bytes]:
     """
     environment = dict(os.environ)
     environment["NPROC"] = str(max(1, int(job.cpus)))  # how many threads XLA starts
+    environment.setdefault("JAX_TRACEBACK_FILTERING", "off")  # whose note is no reason
     if 0 < job.gpus < 1:  # XLA takes most of a GPU's memory otherwise
         environment.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{0.9 * job.gpus:.3f}")
 
@@ -82,13 +83,15 @@ class LocalBackend:
         self._cores: dict[str, list[int]] = {}
         available = getattr(os, "sched_getaffinity", lambda _: range(n_cores()))(0)
         self._free = sorted(available)
+        self._stopped = False
         self._each = max(1, int(cpus))
         self.slots = parallel or len(self._free) // self._each
 
     def submit(self, job: Job) -> None:
-        """Have a job run when there is room."""
-        self._waiting.append(job)
-        self._fill()
+        """Have a job run when there is room; not after `stop`."""
+        if not self._stopped:
+            self._waiting.append(job)
+            self._fill()
 
     def running(self) -> set[str]:
         """Names of jobs whose processes live."""
@@ -109,6 +112,7 @@ class LocalBackend:
 
     def stop(self) -> None:
         """SIGTERM to all."""
+        self._stopped = True
         self._waiting.clear()
         for process in self._processes.values():
             with suppress(ProcessLookupError):
@@ -126,4 +130,6 @@ class LocalBackend:
             # More jobs than cores share all of them.
             cores, self._free = self._free[: self._each], self._free[self._each :]
             self._cores[job.name] = cores
-            self._processes[job.name] = start(job, cores)
+            process = self._processes[job.name] = start(job, cores)
+            if self._stopped:  # while it was being started
+                process.terminate()

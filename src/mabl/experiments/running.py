@@ -50,7 +50,7 @@ class Tally:
 class Running:
     """Jobs on a backend while they run, and what became of them; a context.
 
-    Ctrl-C or SIGTERM has them save and end; again, it is real.
+    Ctrl-C or SIGTERM has them save and end; Ctrl-C again is real.
     """
 
     def __init__(self, backend: Backend, console: Console):
@@ -100,6 +100,10 @@ class Running:
         """Whether there is anything to wait for."""
         stopped = self._stop.received and not self._backend.running()
         return bool(self.going) and not stopped
+
+    def has_failed(self, name: str) -> bool:
+        """Whether a job ended with an error, and not by a signal."""
+        return any(job.name == name and job.failed.exists() for job in self._jobs)
 
     @property
     def stopping(self) -> bool:

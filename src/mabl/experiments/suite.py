@@ -165,9 +165,7 @@ def narrowed(suite: Suite, tasks: Sequence[str], algorithms: Sequence[str]) -> S
         suite,
         tasks=tuple(task for task in suite.tasks if not tasks or task.env in tasks),
         algorithms=tuple(
-            one
-            for one in suite.algorithms
-            if not algorithms or (one.label or one.algo) in algorithms
+            one for one in suite.algorithms if not algorithms or one.name in algorithms
         ),
     )
 

@@ -3,14 +3,17 @@
 import json
 import os
 import signal
+import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import jax
 from rich.console import Console
 
-from mabl.errors import UserError
+from mabl.errors import PREEMPTED, UserError
 from mabl.evaluation import evaluate
 from mabl.experiments.jobs import EVALUATION, Job, in_a_row, is_evaluated, steps_done
 from mabl.policy import load_run
@@ -27,7 +30,7 @@ EVALUATION_SEED = 2**32 - 1
 
 
 def work(job: Job, console: Console) -> signal.Signals | None:
-    """Do what is left of a job; returns what asked it to end early, if anything did."""
+    """Do what is left of a job; returns what asked it to end before, if anything did."""
     wait_for_others([path for path in job.runs().values() if path], console)
     runs = job.runs()
     missing = [seed for seed, path in runs.items() if path is None]
@@ -35,18 +38,18 @@ def work(job: Job, console: Console) -> signal.Signals | None:
     short = [path for path in begun if steps_done(path) < job.config.total_steps]
     for paths in together(short):
         outcome = resume(paths, job.config.total_steps, trust=True, console=console)
-        if outcome.stopped_by:
-            return outcome.stopped_by
+        if outcome.told:
+            return outcome.told
     for seeds in in_a_row(missing):
         config = replace(job.config, seed=seeds[0], num_seeds=len(seeds))
         outcome = train(config, console)
-        if outcome.stopped_by:
-            return outcome.stopped_by
+        if outcome.told:
+            return outcome.told
     for path in job.runs().values():
         if path is not None and not is_evaluated(path, job.eval_episodes):
-            stopped_by = evaluate_run(path, job, console)
-            if stopped_by:
-                return stopped_by
+            told = evaluate_run(path, job, console)
+            if told:
+                return told
     return None
 
 
@@ -82,8 +85,8 @@ def evaluate_run(path: Path, job: Job, console: Console) -> signal.Signals | Non
     loaded, wanted = load_run(path, trust=True), max(job.config.total_steps, steps_done(path))
     if loaded.step < wanted:
         outcome = resume(path, wanted, trust=True, console=console)
-        if outcome.stopped_by:
-            return outcome.stopped_by
+        if outcome.told:
+            return outcome.told
         loaded = load_run(path, trust=True)
     config, key = job.config, jax.random.key(EVALUATION_SEED)
     results = evaluate(
@@ -102,6 +105,16 @@ def evaluate_run(path: Path, job: Job, console: Console) -> signal.Signals | Non
     replace_file(path / EVALUATION, json.dumps(numbers) + "\n")
     console.print(f"evaluated {path}", highlight=False, soft_wrap=True, markup=False)
     return None
+
+
+@contextmanager
+def preemptible() -> Iterator[None]:
+    """SIGTERM ends with its exit code also where there is nothing to save: before, and after."""
+    previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(PREEMPTED))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 def stop_with_parent() -> None:

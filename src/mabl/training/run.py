@@ -42,8 +42,15 @@ class Outcome:
     """How a run ended."""
 
     folders: list[Path]
-    stopped_by: signal.Signals | None
-    """What asked it to end early, if anything did."""
+    told: signal.Signals | None
+    """What asked it to end, if anything did."""
+    finished: bool
+    """Whether it did all its steps all the same."""
+
+    @property
+    def stopped_by(self) -> signal.Signals | None:
+        """What ended it early, if anything did."""
+        return None if self.finished else self.told
 
 
 def train(config: Config, console: Console | None = None) -> Outcome:
@@ -203,16 +210,16 @@ def _run(
         draw_curves(folders, config)
         for log in logs:
             log.close()
-    stopped_by = interruption.received if step < total_steps else None
+    finished = step >= total_steps
     console.print(
-        f"{'interrupted' if stopped_by else 'finished'} at {step:,} steps after "
+        f"{'finished' if finished else 'interrupted'} at {step:,} steps after "
         f"{duration(time.monotonic() - began)}",
         highlight=False,
     )
     for path in folders:
-        hint = f"mabl resume {path}" if stopped_by else f"mabl eval {path}"
+        hint = f"mabl eval {path}" if finished else f"mabl resume {path}"
         console.print(f"next: {hint}", highlight=False, soft_wrap=True)
-    return Outcome(folders, stopped_by)
+    return Outcome(folders, interruption.received, finished)
 
 
 def updates_due(states: TrainState, training: Training) -> tuple[int, int]:
