@@ -2,9 +2,9 @@
 
     uv run python -m benchmarks.suite_scaling --suite quick --total-steps 3000 --nodes 2 1 2
 
-Each number of nodes runs the whole suite anew; compiled programs come from the cache, which the first
-of them fills. Efficiency is the time on one node over n times the time on n. Each job takes one core,
-whatever the machine has.
+Each number of nodes runs the whole suite anew; compiled programs come from the cache, which the
+first of them fills. Efficiency is the time on one node over n times the time on n. Each job takes
+one core, whatever the machine has.
 """
 
 import argparse
@@ -13,6 +13,7 @@ import logging
 import os
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import ray
@@ -26,14 +27,14 @@ from mabl.experiments.suite import load
 
 
 def seconds(suite: str, nodes: int, total_steps: int | None, logdir: Path) -> dict[str, float]:
-    """The whole suite's time on so many nodes, and each job's."""
+    """The whole suite's time on so many nodes."""
     shutil.rmtree(logdir, ignore_errors=True)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     for _ in range(nodes - 1):
         cluster.add_node(num_cpus=1)
     ray.init(cluster.address, log_to_driver=False, logging_level=logging.ERROR)
     try:
-        jobs = jobs_of(load(suite), logdir, total_steps)
+        jobs = jobs_of(replace(load(suite), cpus=1), logdir, total_steps)
         began = time.monotonic()
         tally = run_jobs(jobs, RayBackend(cluster.address), Console(stderr=True))
         whole = time.monotonic() - began
