@@ -1,6 +1,7 @@
 """Shared settings: mabl's warnings are errors, rank promotion raises, programs are cached.
 
-They are compiled quickly instead of well: most tests compute next to nothing.
+They are compiled quickly instead of well, also by the processes that tests start: most compute
+next to nothing.
 """
 
 import os
@@ -11,7 +12,9 @@ os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR",
     str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mabl" / "jax-tests"),
 )
-# Together with optimisations off, below, this saves a third of the time to compile. Later versions
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+# Together with optimisations off, above, this saves a third of the time to compile. Later versions
 # of jaxlib do not know the flag, and abort at one that they do not know.
 FLAG = "--xla_cpu_use_fusion_emitters=false"
 if version("jaxlib").startswith("0.10.") and FLAG not in os.environ.get("XLA_FLAGS", ""):
@@ -21,8 +24,6 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_disable_most_optimizations", True)
 
 
 def pytest_configure(config):
