@@ -14,7 +14,7 @@ from tests.experiments.tiny_suite import (
 )
 
 ALGORITHMS = ("mappo", "mappo+more")
-STEPS = 3_000
+STEPS = 6_000
 
 
 @pytest.fixture
@@ -33,6 +33,12 @@ def on(cluster) -> tuple[str, str]:
     return "--backend=ray", f"--address={cluster.address}"
 
 
+def jobs_on(node, logdir) -> list[str]:
+    """Algorithms whose jobs run there."""
+    places = (logdir / "tiny" / "jobs").glob("*.node")
+    return [p.name.split("_")[1] for p in places if node.node_id in p.read_text()]
+
+
 def has_saved(logdir, algo) -> bool:
     return any(path for run in runs_of(logdir, algo, 0) for path in run.glob("checkpoints/step_*"))
 
@@ -44,7 +50,7 @@ def test_a_suite_survives_the_loss_of_a_node(nodes, tmp_path):
     undisturbed, logdir = tmp_path / "whole", tmp_path / "cut"
     assert finish(suite, undisturbed) == 0
     process = start(suite, logdir, *on(cluster))
-    wait_for(lambda: all(has_saved(logdir, name) for name in ALGORITHMS))
+    wait_for(lambda: any(has_saved(logdir, name) for name in jobs_on(second, logdir)))
     cluster.remove_node(second, allow_graceful=False)
     assert process.wait(200) == 0 and "2 done" in said(logdir)
     logs = sorted((logdir / "tiny" / "jobs").glob("*.log"))

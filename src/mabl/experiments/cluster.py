@@ -99,14 +99,16 @@ class RayBackend:
 
 
 def place_of(job: Job) -> Path:
-    """A file that is there while a job runs, and names its node."""
+    """A file that is there while a job runs: its machine, and what Ray calls that node."""
     return job.folder / f"{job.name}.node"
 
 
 def _run(cwd: Path, job: Job) -> int:
     """A job on whatever node this is."""
+    import ray
+
     os.chdir(cwd)
-    place_of(job).write_text(os.uname().nodename)
+    place_of(job).write_text(f"{os.uname().nodename} {ray.get_runtime_context().get_node_id()}\n")
     process = start(job)
     try:
         while process.poll() is None:  # not in one wait, which no cancellation would end
