@@ -14,9 +14,11 @@ def heard():
     """An interruption; how often it was obeyed; and what it says."""
     obeyed, said = [], io.StringIO()
     previous = signal.getsignal(signal.SIGTERM)
+    ctrl_c = signal.signal(signal.SIGINT, signal.default_int_handler)  # pytest-xdist ignores it
     with Interruption(Console(file=said), "stopping", lambda: obeyed.append(1)) as wish:
         yield wish, obeyed, said
     assert signal.getsignal(signal.SIGTERM) is previous
+    assert signal.signal(signal.SIGINT, ctrl_c) is signal.default_int_handler
 
 
 def test_a_process_and_its_group_may_be_told_at_once(heard):
