@@ -77,7 +77,9 @@ def suite(arguments: list[str]) -> int:
         case ["-h" | "--help", *_]:
             print(SUITE_VERBS)
             return 0
-    raise UserError("mabl suite needs a verb: give mabl suite run SUITE, or mabl suite list")
+    raise UserError(
+        "mabl suite needs a verb: give mabl suite run SUITE, suite jobs SUITE or suite list"
+    )
 
 
 def run_suite(given: SuiteArguments) -> int:
