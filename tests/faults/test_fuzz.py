@@ -113,7 +113,8 @@ arguments = st.lists(
 def test_command_lines(nowhere, command, given):
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(nowhere):
         # What has been understood is not carried out: that is for other tests.
-        patch.setattr(training_run, "train", lambda config: training_run.Outcome([], None))
+        ended = training_run.Outcome([], None, finished=True)
+        patch.setattr(training_run, "train", lambda config: ended)
         patch.setattr("mabl.envs.registry.names", refuse)
         patch.setattr("mabl.evaluation.evaluate", refuse)
         patch.setattr("mabl.playing.film", refuse)
