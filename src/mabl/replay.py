@@ -4,37 +4,42 @@ Functions are written for one lane (one environment's rows, contiguous in time) 
 caller vmaps over lanes. All of it lives on the device and inside the compiled training cycle.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from mabl.devices import spread
-from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 
 
 class Replay(NamedTuple):
     """A ring of rows; `[C, ...]` for one lane, `[E, C, ...]` for all."""
 
-    rows: TimeStep
+    rows: Any
+    """`TimeStep`s, or a pytree that holds more of each step."""
     cursor: Int[Array, "*e"]
     """Where the next row goes."""
     size: Int[Array, "*e"]
     """Rows held."""
 
 
-def empty(row: TimeStep, capacity: int) -> Replay:
+def _rows_in(rows: Any, axis: int = 0) -> int:
+    """Length of an axis that all arrays of a pytree share."""
+    return jax.tree.leaves(rows)[0].shape[axis]
+
+
+def empty(row: Any, capacity: int) -> Replay:
     """A lane for `capacity` rows shaped like `row`."""
     rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), row)
     return Replay(rows, cursor=jnp.int32(0), size=jnp.int32(0))
 
 
-def add(replay: Replay, rows: TimeStep, count: Int[Array, ""]) -> Replay:
+def add(replay: Replay, rows: Any, count: Int[Array, ""]) -> Replay:
     """Append the first `count` of `rows` `[R, ...]`, overwriting the oldest."""
-    capacity = replay.rows.reward.shape[0]
-    offset = jnp.arange(rows.reward.shape[0])
+    capacity = _rows_in(replay.rows)
+    offset = jnp.arange(_rows_in(rows))
     # Rows past `count` are sent out of bounds, where the scatter drops them.
     index = jnp.where(offset < count, (replay.cursor + offset) % capacity, capacity)
     return Replay(
@@ -52,13 +57,13 @@ def cut(replay: Replay, truncated: Bool[Array, ""]) -> Replay:
     return replay._replace(rows=rows._replace(truncated=now))
 
 
-def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int) -> TimeStep:
+def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int) -> Any:
     """Draw `[B, T, ...]` uniformly from all runs of `length` rows, over all lanes `[E, C, ...]`.
 
     Sequences cross episode boundaries (`is_first` marks them) but never the ring's seam. Some lane
     must hold at least `length` rows.
     """
-    capacity = replay.rows.reward.shape[1]
+    capacity = _rows_in(replay.rows, axis=1)
     starts = jnp.maximum(replay.size - length + 1, 0)
     ends = jnp.cumsum(starts)
     pick = jax.random.randint(key, (batch_size,), 0, ends[-1])

@@ -11,6 +11,8 @@ from jaxtyping import Array, Bool, Float, Key, Shaped
 from mabl.rows import TimeStep
 
 PRNGKey = Key[Array, ""]
+Progress = Float[Array, ""] | float
+"""Share of a run's environment steps that are done, in [0, 1]."""
 
 
 class TeamView(NamedTuple):

@@ -7,7 +7,7 @@ from mabl.envs.base import EnvSpec
 from mabl.execution import Policy
 from mabl.replay import Replay
 from mabl.rollout import Collector, Rollout
-from mabl.types import Metrics, PRNGKey
+from mabl.types import Metrics, PRNGKey, Progress
 
 
 class Experience(NamedTuple):
@@ -19,6 +19,8 @@ class Experience(NamedTuple):
     """Where each environment stood when the newest rows began."""
     newest: Rollout
     """The rows of this cycle, their rewards scaled like the replay's."""
+    progress: Progress = 0.0
+    """Share of the run's environment steps that are done: schedules depend on it."""
 
 
 class Algorithm(Protocol):

@@ -17,7 +17,7 @@ from mabl.imagination import Dream, Imagined
 from mabl.nets.mlp import MLP, Features, parts_of, widths_of
 from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
-from mabl.types import Metrics, PRNGKey, Replayed, Trajectory
+from mabl.types import Metrics, PRNGKey, Progress, Replayed, Trajectory
 from mabl.world_models.base import decoder_losses, kl_losses, observe_batch
 from mabl.world_models.heads import Predictions
 from mabl.world_models.mamba import Team
@@ -111,7 +111,7 @@ class MAG(NamedTuple):
         """As without lookahead, but for how imagination goes on."""
         key_imagine, key_learn = jax.random.split(key)
         imagined = self.imagine(learner, experience.replay, key_imagine)
-        return self.learn(learner, *imagined, key_learn)
+        return self.learn(learner, *imagined, key_learn, experience.progress)
 
     def imagine(
         self, learner: LookaheadLearner, replay: Replay, key: PRNGKey
@@ -126,10 +126,15 @@ class MAG(NamedTuple):
         return self.base.imagine(learner.base, replay, key, step)
 
     def learn(
-        self, learner: LookaheadLearner, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
+        self,
+        learner: LookaheadLearner,
+        trajectory: Trajectory,
+        replayed: Replayed,
+        key: PRNGKey,
+        progress: Progress = 0.0,
     ) -> tuple[LookaheadLearner, Metrics]:
         """Train the policy on trajectories."""
-        base, metrics = self.base.learn(learner.base, trajectory, replayed, key)
+        base, metrics = self.base.learn(learner.base, trajectory, replayed, key, progress)
         return learner._replace(base=base), metrics
 
     def diagnose(self, learner: LookaheadLearner, replay: Replay, key: PRNGKey) -> Metrics:

@@ -22,7 +22,7 @@ from mabl.nets.categorical import still
 from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
 from mabl.rows import TimeStep, is_last
-from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
+from mabl.types import Metrics, PRNGKey, Progress, Replayed, TeamView, Trajectory
 from mabl.world_models.base import WorldModel, WorldModelConfig, model_loss, observe_sequence
 
 N_DIAGNOSED = 128
@@ -62,7 +62,7 @@ class ModelBased(NamedTuple):
         key_model, key_behaviour = jax.random.split(key)
         model = self.world_model(self.spec, self.config.world_model, key_model)
         shape = (self.spec.n_agents, self.spec.action_space.size)
-        view = self._view(model, model.initial(), jnp.ones(shape, bool), jnp.ones(shape[0], bool))
+        view = self.view(model, model.initial(), jnp.ones(shape, bool), jnp.ones(shape[0], bool))
         behaviour = self.behaviour.init(view, self.spec.action_space, key_behaviour)
         return Learner(model, self._optimiser().init(eqx.filter(model, eqx.is_array)), behaviour)
 
@@ -93,7 +93,7 @@ class ModelBased(NamedTuple):
         """Draw B_R sequences, imagine from their latents, train theta and phi (lines 10-13)."""
         key_imagine, key_learn = jax.random.split(key)
         imagined = self.imagine(learner, experience.replay, key_imagine)
-        return self.learn(learner, *imagined, key_learn)
+        return self.learn(learner, *imagined, key_learn, experience.progress)
 
     def imagine(
         self, learner: Learner, replay: Replay, key: PRNGKey, step: Step = Dream.step
@@ -108,16 +108,23 @@ class ModelBased(NamedTuple):
         trajectory = jax.vmap(
             lambda *start: imagine_trajectory(dream, *start, step=step), out_axes=1
         )(start, weight, jax.random.split(key_imagine, weight.shape[0]))
-        view = jax.vmap(jax.vmap(lambda *state: self._view(learner.model, *state)))(
+        view = jax.vmap(jax.vmap(lambda *state: self.view(learner.model, *state)))(
             latents, rows.available, rows.alive
         )
         return trajectory, Replayed(view, rows)
 
     def learn(
-        self, learner: Learner, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
+        self,
+        learner: Learner,
+        trajectory: Trajectory,
+        replayed: Replayed,
+        key: PRNGKey,
+        progress: Progress = 0.0,
     ) -> tuple[Learner, Metrics]:
         """Train theta and phi on trajectories (lines 12-13)."""
-        behaviour, metrics = self.behaviour.update(learner.behaviour, trajectory, replayed, key)
+        behaviour, metrics = self.behaviour.update(
+            learner.behaviour, trajectory, replayed, key, progress
+        )
         return learner._replace(behaviour=behaviour), metrics
 
     def diagnose(self, learner: Learner, replay: Replay, key: PRNGKey) -> Metrics:
@@ -131,7 +138,7 @@ class ModelBased(NamedTuple):
         metrics = diagnose(learner.model, latents, rows, key_diagnose, self.spec.action_space)
 
         def value(latent: Any, row: TimeStep) -> Array:
-            view = self._view(learner.model, latent, row.available, row.alive)
+            view = self.view(learner.model, latent, row.available, row.alive)
             return self.behaviour.value(learner.behaviour, view).mean()
 
         metrics["behaviour/value_at_reset"] = (
@@ -155,7 +162,7 @@ class ModelBased(NamedTuple):
         keys = jax.random.split(key, rows.is_first.shape[0])
         return still(jax.vmap(lambda *at: observe_sequence(learner.model, *at)[0])(rows, keys))
 
-    def _view(self, model: WorldModel, latent: Any, available: Array, alive: Array) -> TeamView:
+    def view(self, model: WorldModel, latent: Any, available: Array, alive: Array) -> TeamView:
         """What behaviour sees of one row's latent."""
         features = self.behaviour.critic_features(model, latent)
         return TeamView(model.actor_features(latent), features, available, alive)

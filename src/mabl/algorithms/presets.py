@@ -252,7 +252,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
             "hidden": 128,
             "learning_rate": 1e-3,
             "batch_size": 500,
-            "epsilon_updates": 40,
+            "epsilon_share": 0.17,
         },
     },
     ("quick", "test", "mamba"): _MAMBA_TEST | {"mappo": {"ent_coef": 0.5}},
@@ -267,7 +267,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
             "hidden": 64,
             "learning_rate": 1e-3,
             "batch_size": 200,
-            "epsilon_updates": 60,
+            "epsilon_share": 0.6,
         },
     },
 }

@@ -49,6 +49,12 @@ class MaskedCategorical(NamedTuple):
         return -(jnp.exp(self.log_probs) * self.log_probs).sum(-1)
 
     @staticmethod
+    def most_entropy(available: Bool[Array, "*b A"]) -> Float[Array, "*b"]:
+        """Entropy of the uniform policy over what is available, in nats."""
+        n = available.sum(-1)
+        return jnp.log(jnp.where(n > 0, n, available.shape[-1]))
+
+    @staticmethod
     def free(available: Bool[Array, "*b A"]) -> Bool[Array, "*b"]:
         """Where there is a choice: more than one action, or none, which masks none."""
         return available.sum(-1) != 1
@@ -87,6 +93,11 @@ class CensoredNormal(NamedTuple):
         return (each * self.exists).sum(-1)
 
     @staticmethod
+    def most_entropy(available: Bool[Array, "*b A"]) -> Float[Array, "*b"]:
+        """Entropy of the uniform distribution over [-1, 1] in each dimension, in nats."""
+        return available.sum(-1) * log(2.0)
+
+    @staticmethod
     def free(available: Bool[Array, "*b A"]) -> Bool[Array, "*b"]:
         """Where there is a choice: a dimension at least."""
         return available.any(-1)
@@ -97,6 +108,12 @@ class CensoredNormal(NamedTuple):
 
 Choice = MaskedCategorical | CensoredNormal
 """What a policy is at one agent's features."""
+
+
+def has_choice(action: Array, available: Bool[Array, "*b A"]) -> Bool[Array, "*b"]:
+    """Where an agent could have done something else: `action` only tells the kind of space."""
+    kind = MaskedCategorical if jnp.issubdtype(action.dtype, jnp.integer) else CensoredNormal
+    return kind.free(available)
 
 
 class Actor(eqx.Module):

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
 import jax
+import jax.numpy as jnp
 from einops import rearrange
 from jaxtyping import Array, Bool, Float, Int
 
@@ -11,10 +12,22 @@ from mabl.behaviour.actor import Choice
 from mabl.devices import spread
 from mabl.envs.base import ActionSpace
 from mabl.nets.mlp import Features
-from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
+from mabl.types import Metrics, PRNGKey, Progress, Replayed, TeamView, Trajectory
 
 S = TypeVar("S")
 Rows = TypeVar("Rows")
+
+
+def annealed(start: float, end: float, progress: Progress) -> Float[Array, ""]:
+    """A coefficient that falls geometrically from `start` to `end` over the run.
+
+    Where one of them is 0 it falls linearly.
+    """
+    progress = jnp.clip(jnp.float32(progress), 0, 1)
+    if start > 0 and end > 0:
+        return start * (end / start) ** progress
+    return start + (end - start) * progress
+
 
 ActorFunction = Callable[[Features, Bool[Array, " A"]], Choice]
 """A policy: one agent's features and available actions to a choice; a pytree of its parameters."""
@@ -43,9 +56,17 @@ class Behaviour(Protocol[S]):
         ...
 
     def update(
-        self, state: S, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
+        self,
+        state: S,
+        trajectory: Trajectory,
+        replayed: Replayed,
+        key: PRNGKey,
+        progress: Progress = 0.0,
     ) -> tuple[S, Metrics]:
-        """Learn from trajectories of the present policy, and from the sequences they began in."""
+        """Learn from trajectories of the present policy, and from the sequences they began in.
+
+        `progress` is the share of the run that is done: schedules depend on it alone.
+        """
         ...
 
 
@@ -60,6 +81,20 @@ def minibatches(key: PRNGKey, n_rows: int, batch_size: int, n_epochs: int) -> In
     def shuffled(key: PRNGKey) -> Int[Array, "m B"]:
         order = jax.random.permutation(key, n_rows)[: n_rows // size * size]
         return rearrange(order, "(m b) -> m b", b=size)
+
+    return rearrange(jax.vmap(shuffled)(jax.random.split(key, n_epochs)), "e m b -> (e m) b")
+
+
+def divided(key: PRNGKey, n_rows: int, n_parts: int, n_epochs: int) -> Int[Array, "M B"]:
+    """Indices of `n_epochs` shuffles of `n_rows`, each divided into `n_parts` of one size.
+
+    The remainder is left out of that epoch; a part has one row at least.
+    """
+    size = max(n_rows // n_parts, 1)
+
+    def shuffled(key: PRNGKey) -> Int[Array, "m B"]:
+        order = jax.random.permutation(key, n_rows)
+        return order[jnp.arange(n_parts * size) % n_rows].reshape(n_parts, size)
 
     return rearrange(jax.vmap(shuffled)(jax.random.split(key, n_epochs)), "e m b -> (e m) b")
 

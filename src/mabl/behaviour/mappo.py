@@ -12,8 +12,8 @@ import optax
 from einops import rearrange
 from jaxtyping import Array, Float
 
-from mabl.behaviour.actor import Actor, Choice, ContinuousActor, actor_for
-from mabl.behaviour.base import ActorFunction, minibatch_of, minibatches
+from mabl.behaviour.actor import Actor, Choice, ContinuousActor, actor_for, has_choice
+from mabl.behaviour.base import ActorFunction, annealed, divided, minibatch_of, minibatches
 from mabl.behaviour.critic import Critic
 from mabl.envs.base import ActionSpace
 from mabl.errors import UserError, require_between, require_positive
@@ -23,7 +23,7 @@ from mabl.nets.mlp import Features, widths_of
 from mabl.nets.normaliser import Normaliser
 from mabl.nets.optimiser import guarded
 from mabl.rows import TimeStep
-from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
+from mabl.types import Metrics, PRNGKey, Progress, Replayed, TeamView, Trajectory
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,11 @@ class MAPPOConfig:
     """Joint rows in a PPO minibatch."""
     ent_coef: float = 0.001
     """Entropy bonus at the start."""
+    ent_final: float | None = None
+    """Entropy bonus at the end of the run, which it approaches geometrically with the share of
+    `total_steps` that is done; None: it falls by `ent_decay`, as in the paper."""
     ent_decay: float = 0.99998
-    """Factor on the entropy bonus after every minibatch."""
+    """Factor on the entropy bonus after every minibatch, where there is no `ent_final`."""
     value_coef: float = 0.5
     """Factor on the critic's squared error."""
     value_decay: float = 1.0
@@ -73,7 +76,11 @@ class MAPPOConfig:
     """Weight of the critic's error on replayed sequences beside that on imagined ones (ADR 8); 0 in
     the paper."""
     normalise_advantage: bool = True
-    """Give advantages zero mean and unit variance over the imagined rows of the living."""
+    """Give advantages zero mean and unit variance over the imagined rows that the policy's loss
+    counts."""
+    advantage_floor: float = 0.0
+    """Smallest standard deviation that advantages are divided by, in scaled rewards: differences
+    below it are treated as noise. 0 in the paper."""
     team_reward: bool = True
     """Average predicted rewards over agents (SMAC, MAMuJoCo)."""
     global_critic: bool = False
@@ -86,7 +93,7 @@ class MAPPOConfig:
         )
         require_between(self, 0, 1, "gamma", "gae_lambda", "ent_decay", "value_decay")
         require_between(self, 0, inf, "actor_weight_decay", "ent_coef", "value_coef")
-        require_between(self, 0, inf, "replay_value_coef")
+        require_between(self, 0, inf, "replay_value_coef", "advantage_floor", "ent_final")
         if self.hidden % self.n_heads:
             raise UserError(
                 f"--mappo.hidden is {self.hidden}: give a multiple of its {self.n_heads} heads"
@@ -180,13 +187,21 @@ class MAPPO(NamedTuple):
         return state.value(view.critic_features)
 
     def update(
-        self, state: ActorCritic, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
+        self,
+        state: ActorCritic,
+        trajectory: Trajectory,
+        replayed: Replayed,
+        key: PRNGKey,
+        progress: Progress = 0.0,
     ) -> tuple[ActorCritic, Metrics]:
         """`n_epochs` of minibatch PPO on one set of trajectories (Algorithm 1, lines 12-13).
 
-        With `replay_value_coef` the critic learns from replayed rows too, all of them in every
-        minibatch.
+        With `replay_value_coef` the critic learns from replayed rows too, which each epoch divides
+        among its minibatches.
         """
+        if self.config.ent_final is not None:
+            ent_coef = annealed(self.config.ent_coef, self.config.ent_final, progress)
+            state = state._replace(ent_coef=ent_coef)
         real = None
         if self.config.replay_value_coef:
             real = jax.vmap(lambda replayed: replayed_values(state.value, replayed, self.config))(
@@ -223,7 +238,7 @@ def experience(
         reward, config.gamma * trajectory.continues, value[1:], config.gae_lambda
     )
     advantage = target - value[:-1]
-    counted = weight * view.alive[:-1]
+    counted = weight * view.alive[:-1] * has_choice(trajectory.action, view.available[:-1])
     centred = advantage - weighted_mean(advantage, counted)
     std = jnp.sqrt(weighted_mean(centred**2, counted))
     metrics = {
@@ -236,7 +251,9 @@ def experience(
         jax.tree.map(lambda x: x[:-1], view),
         trajectory.action,
         trajectory.log_prob,
-        centred / (std + 1e-5) if config.normalise_advantage else advantage,
+        centred / (jnp.maximum(std, config.advantage_floor) + 1e-5)
+        if config.normalise_advantage
+        else advantage,
         target,
         weight,
     )
@@ -307,9 +324,11 @@ def policy_loss(
     entropy = weighted_mean(policy.entropy(), weight)
     loss = weighted_mean(surrogate, weight) - ent_coef * entropy
     ratio = jnp.exp(log_prob - rows.log_prob)
+    share = policy.entropy() / jnp.maximum(policy.most_entropy(rows.view.available), 1e-6)
     return loss, {
         "behaviour/actor_loss": loss,
         "behaviour/entropy": entropy,
+        "behaviour/entropy_share": weighted_mean(share, weight),
         "behaviour/clip_fraction": weighted_mean(1.0 * (jnp.abs(ratio - 1) > clip), weight),
         "behaviour/approx_kl": weighted_mean(rows.log_prob - log_prob, weight),
     }
@@ -333,30 +352,43 @@ def update(
 ) -> tuple[ActorCritic, Metrics]:
     """`n_epochs` of minibatch PPO on one set of trajectories (Algorithm 1, lines 12-13).
 
-    The critic learns from `replayed` rows too, all of them in every minibatch, if there are any.
+    The critic learns from `replayed` rows too, if there are any: each epoch divides them among its
+    minibatches. `behaviour/update_kl` is KL(old || new) of the policy before and after the whole
+    update, estimated on one minibatch's actions [J. Schulman, "Approximating KL divergence"].
     """
     rows, metrics = experience(state.value, trajectory, config)
     returns = state.returns.update(rows.target, rows.weight, config.value_decay)
     rows = rows._replace(target=returns.normalise(rows.target))
     if replayed is not None:
         replayed = replayed._replace(target=returns.normalise(replayed.target))
-    batches = minibatches(key, rows.target.shape[0], config.batch_size, config.n_epochs)
+    n_rows = rows.target.shape[0]
+    batches = minibatches(key, n_rows, config.batch_size, config.n_epochs)
+    if replayed is not None:
+        per_epoch = batches.shape[0] // config.n_epochs
+        real_batches = divided(
+            jax.random.fold_in(key, 1), replayed.target.shape[0], per_epoch, config.n_epochs
+        )
     actor_optimiser, critic_optimiser = optimisers(config)
 
-    def critic_objective(critic: Critic, batch: PPORows) -> tuple[Float[Array, ""], Metrics]:
+    def critic_objective(
+        critic: Critic, batch: PPORows, replayed: ValueRows | None
+    ) -> tuple[Float[Array, ""], Metrics]:
         loss, metrics = critic_loss(critic, batch, config.value_coef)
         if replayed is not None:
             real, _ = critic_loss(critic, replayed, config.replay_value_coef * config.value_coef)
             loss, metrics = loss + real, metrics | {"behaviour/replay_critic_loss": real}
         return loss, metrics
 
-    def minibatch(state: ActorCritic, index: Array) -> tuple[ActorCritic, Metrics]:
-        batch = minibatch_of(rows, index)
+    def minibatch(
+        state: ActorCritic, index: tuple[Array, Array | None]
+    ) -> tuple[ActorCritic, Metrics]:
+        batch = minibatch_of(rows, index[0])
+        real = None if index[1] is None else minibatch_of(replayed, index[1])
         actor_grad, actor_metrics = eqx.filter_grad(actor_loss, has_aux=True)(
             state.actor, batch, state.ent_coef, config.clip
         )
         critic_grad, critic_metrics = eqx.filter_grad(critic_objective, has_aux=True)(
-            state.critic, batch
+            state.critic, batch, real
         )
         actor_step, actor_opt = actor_optimiser.update(actor_grad, state.actor_opt, state.actor)  # pyright: ignore[reportArgumentType]
         critic_step, critic_opt = critic_optimiser.update(critic_grad, state.critic_opt)
@@ -365,10 +397,24 @@ def update(
             critic=eqx.apply_updates(state.critic, critic_step),
             actor_opt=actor_opt,
             critic_opt=critic_opt,
-            ent_coef=state.ent_coef * config.ent_decay,
+            ent_coef=state.ent_coef * (config.ent_decay if config.ent_final is None else 1.0),
             returns=returns,
         )
         return state, actor_metrics | critic_metrics
 
-    state, history = jax.lax.scan(minibatch, state, batches)
-    return state, metrics | jax.tree.map(jnp.mean, history) | {"behaviour/ent_coef": state.ent_coef}
+    state, history = jax.lax.scan(
+        minibatch, state, (batches, None if replayed is None else real_batches)
+    )
+    return state, metrics | jax.tree.map(jnp.mean, history) | {
+        "behaviour/ent_coef": state.ent_coef,
+        "behaviour/update_kl": update_kl(state.actor, minibatch_of(rows, batches[0])),
+        "behaviour/gradient_steps": jnp.float32(batches.shape[0]),
+    }
+
+
+def update_kl(actor: ActorFunction, rows: PPORows) -> Float[Array, ""]:
+    """KL(old || new) on `rows`, whose actions the old policy drew: E_old[r - 1 - log r]."""
+    policy = jax.vmap(jax.vmap(actor))(rows.view.actor_features, rows.view.available)
+    weight = rows.weight * rows.view.alive * policy.free(rows.view.available)
+    log_ratio = jnp.where(weight > 0, policy.log_prob(rows.action) - rows.log_prob, 0.0)
+    return weighted_mean(jnp.expm1(log_ratio) - log_ratio, weight)

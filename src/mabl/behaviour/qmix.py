@@ -17,7 +17,7 @@ from mabl.errors import require_between, require_positive
 from mabl.losses.returns import lambda_returns
 from mabl.nets.mlp import MLP, Features, Part, Width, parts_of, widths_of
 from mabl.nets.optimiser import guarded
-from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
+from mabl.types import Metrics, PRNGKey, Progress, Replayed, TeamView, Trajectory
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class QMIXConfig:
     """Probability of a random action at the start."""
     epsilon_end: float = 0.05
     """Probability of a random action at the end."""
-    epsilon_updates: int = 2000
-    """Policy updates over which it falls."""
+    epsilon_share: float = 0.25
+    """Share of the run over which it falls."""
 
     def __post_init__(self) -> None:
         require_positive(self, "hidden", "n_hidden", "mixer_hidden", "hypernet_hidden")
         require_positive(self, "learning_rate", "grad_clip", "n_epochs", "batch_size")
-        require_positive(self, "epsilon_updates")
+        require_positive(self, "epsilon_share")
         require_between(self, 0, 1, "gamma", "td_lambda", "target_rate")
         require_between(self, 0, 1, "epsilon_start")
         require_between(self, 0, self.epsilon_start, "epsilon_end")
@@ -184,9 +184,14 @@ class QMIX(NamedTuple):
         return jnp.broadcast_to(total, view.alive.shape)
 
     def update(
-        self, state: QState, trajectory: Trajectory, replayed: Replayed, key: PRNGKey
+        self,
+        state: QState,
+        trajectory: Trajectory,
+        replayed: Replayed,
+        key: PRNGKey,
+        progress: Progress = 0.0,
     ) -> tuple[QState, Metrics]:
-        """`n_epochs` of minibatch regression on one set of trajectories; epsilon falls a step."""
+        """`n_epochs` of minibatch regression on one set of trajectories."""
         del replayed
         config = self.config
         rows, metrics = experience(state, trajectory, config)
@@ -203,10 +208,15 @@ class QMIX(NamedTuple):
             return QState(values, target, opt, state.epsilon), metrics
 
         state, history = jax.lax.scan(minibatch, state, batches)
-        fall = (config.epsilon_start - config.epsilon_end) / config.epsilon_updates
-        epsilon = jnp.maximum(state.epsilon - fall, config.epsilon_end)
+        epsilon = annealed_epsilon(config, progress)
         metrics |= jax.tree.map(jnp.mean, history) | {"behaviour/epsilon": epsilon}
         return state._replace(epsilon=epsilon), metrics
+
+
+def annealed_epsilon(config: QMIXConfig, progress: Progress) -> Float[Array, ""]:
+    """Probability of a random action: it falls linearly over the first `epsilon_share`."""
+    done = jnp.clip(progress / config.epsilon_share, 0, 1)
+    return config.epsilon_start + (config.epsilon_end - config.epsilon_start) * done
 
 
 def optimiser(config: QMIXConfig) -> optax.GradientTransformation:

@@ -17,8 +17,8 @@ from mabl.host_rollout import HostRollouts, act_where
 from mabl.training.loop import Training, TrainState, cycle_keys
 from mabl.types import Metrics
 
-Cycle = Callable[[TrainState, int, int], tuple[TrainState, Metrics]]
-"""Lines 3-14 for every seed; it consumes the states that it is given."""
+Cycle = Callable[..., tuple[TrainState, Metrics]]
+"""`Training.cycle` for every seed; it consumes the states that it is given."""
 
 
 def hosted_cycle(
@@ -51,7 +51,11 @@ def hosted_cycle(
         return jax.tree.map(lambda x: np.reshape(x, (*shape, *x.shape[1:])), tree)
 
     def cycle(
-        rollouts: HostRollouts, states: TrainState, n_model: int, n_policy: int
+        rollouts: HostRollouts,
+        states: TrainState,
+        n_model: int,
+        n_policy: int,
+        total_steps: int = 0,
     ) -> tuple[TrainState, Metrics]:
         policy, keys = policies(states.learner), keys_of(states.key)
 
@@ -79,6 +83,7 @@ def hosted_cycle(
             rollout,
             n_model,
             n_policy,
+            total_steps,
         )
 
     @contextmanager

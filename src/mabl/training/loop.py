@@ -68,12 +68,16 @@ class Training(NamedTuple):
         return TrainState(learner, replay, collectors, key, jnp.int32(0), jnp.int32(0))
 
     def cycle(
-        self, state: TrainState, n_model: Int[Array, ""], n_policy: Int[Array, ""]
+        self,
+        state: TrainState,
+        n_model: Int[Array, ""],
+        n_policy: Int[Array, ""],
+        total_steps: Int[Array, ""] | int = 0,
     ) -> tuple[TrainState, Metrics]:
         """Lines 3-14: collect, then `learn`, where environments are compiled too."""
         key = cycle_keys(state.key).collect
         collectors, collected = self.collect(state.learner, state.collectors, key)
-        return self.learn(state, collectors, collected, n_model, n_policy)
+        return self.learn(state, collectors, collected, n_model, n_policy, total_steps)
 
     def learn(
         self,
@@ -82,18 +86,21 @@ class Training(NamedTuple):
         collected: Rollout,
         n_model: Int[Array, ""],
         n_policy: Int[Array, ""],
+        total_steps: Int[Array, ""] | int = 0,
     ) -> tuple[TrainState, Metrics]:
         """Lines 4-14: store what was collected, `n_model` model updates, `n_policy` policy updates.
 
-        Metrics are means over the cycle's updates (NaN if there were none) and sums over the
-        cycle.
+        `total_steps` is the length of the run, which schedules are shares of; with 0 they stay at
+        their start. Metrics are means over the cycle's updates (NaN if there were none) and sums
+        over the cycle.
         """
         key, _, key_model, key_policy = cycle_keys(state.key)
         replay = state.replay
         if isinstance(self.env, Hosted):
             replay = jax.vmap(replays.cut)(replay, state.collectors.row.truncated)
         replay = self.store(replay, collected)
-        experience = Experience(replay, state.collectors, collected)
+        progress = jnp.where(total_steps > 0, state.env_steps / jnp.maximum(total_steps, 1), 0.0)
+        experience = Experience(replay, state.collectors, collected, progress)
         before = state.learner
         learner, model_metrics = repeat(
             lambda learner, key: self.algorithm.update_model(learner, experience, key),

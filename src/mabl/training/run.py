@@ -178,7 +178,7 @@ def _run(
             n_model, n_policy = updates_due(states, training)
             if n_model and int(states.model_updates[0]) < config.training.pretrain_updates:
                 console.print(f"pretraining the model: {n_model} updates ...", highlight=False)
-            states, metrics = cycle(states, n_model, n_policy)
+            states, metrics = cycle(states, n_model, n_policy, total_steps)
             step = int(states.env_steps.min())
             if longest_lane(states) >= DIAGNOSED_ROWS and crossed(
                 before, step, config.training.diagnose_every
