@@ -48,7 +48,7 @@ TINY = QMIXConfig(
     batch_size=9,
     epsilon_start=0.9,
     epsilon_end=0.3,
-    epsilon_updates=4,
+    epsilon_share=0.8,
 )
 
 
@@ -349,9 +349,11 @@ def update():
     """`QMIX.update`, compiled once for each configuration."""
 
     @eqx.filter_jit
-    def run(qmix: QMIX, state: QState, trajectory: Trajectory, key: Array = KEY):
+    def run(
+        qmix: QMIX, state: QState, trajectory: Trajectory, key: Array = KEY, progress: float = 0.0
+    ):
         replayed = Replayed(trajectory.view, CoordinationEnv().reset(jax.random.key(0))[1])
-        return qmix.update(state, trajectory, replayed, key)
+        return qmix.update(state, trajectory, replayed, key, progress)
 
     return run
 
@@ -407,15 +409,15 @@ def test_target_networks_follow_every_minibatch(bandit, update):
         assert_allclose(target, value, rtol=1e-5, atol=1e-7)
 
 
-def test_epsilon_falls_linearly_with_updates_and_stops_at_its_end(bandit, update):
+def test_epsilon_falls_linearly_over_its_share_of_the_run_and_stops_at_its_end(bandit, update):
     qmix, state, trajectory = bandit
-    # From 0.9 to 0.3 in 4 updates: 0.15 each, however many minibatches an update has
+    # From 0.9 to 0.3 over the first 0.8 of the run, however many updates that takes
     seen = []
-    for _ in range(6):
-        state, metrics = update(qmix, state, trajectory)
+    for progress in (0.0, 0.2, 0.4, 0.8, 1.0, 1.5):
+        state, metrics = update(qmix, state, trajectory, progress=progress)
         assert metrics["behaviour/epsilon"] == state.epsilon == qmix.actor(state).epsilon
         seen.append(float(state.epsilon))
-    assert_allclose(seen, [0.75, 0.6, 0.45, 0.3, 0.3, 0.3], rtol=1e-5)
+    assert_allclose(seen, [0.9, 0.75, 0.6, 0.3, 0.3, 0.3], rtol=1e-5)
 
 
 def test_gradients_reach_every_parameter_of_the_agents_values_and_of_the_mixer(bandit):
