@@ -19,9 +19,10 @@ from mabl.envs.base import Discrete
 from mabl.envs.counting import CountingEnv
 from mabl.imagination import Dream, ImaginationConfig, Imagined, imagine_trajectory
 from mabl.replay import sample_sequences
+from mabl.rows import is_last
 from mabl.training.loop import Training, steps_in
 from mabl.types import Trajectory
-from mabl.world_models.base import observe_sequence
+from mabl.world_models.base import WorldModelConfig, observe_sequence
 from mabl.world_models.heads import Predictions
 from mabl.world_models.mabl import MABL
 
@@ -167,7 +168,16 @@ def test_starts_pair_each_latent_with_its_own_rows_availability_life_and_end(dra
     assert_array_equal(latent.obs[:, :, 0], np.stack([t, t], -1))
     assert_array_equal(available, (np.arange(3) != t[:, None] % 3)[:, None].repeat(2, 1))
     assert_array_equal(alive, np.stack([t % 2 == 0, t % 4 < 2], -1))
-    assert_array_equal(weight, np.where(episode % 2 == 0, t != 5, t != 7))
+    goes_on = np.where(episode % 2 == 0, t != 5, t != 7)
+    assert_array_equal(weight, goes_on)
+    if n_starts is None:
+        # All rows, those that end an episode replaced by others.
+        assert goes_on.all()
+        ended = is_last(rows).ravel()
+        assert ended.sum() > 1
+        every = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), seen.state)
+        assert_array_equal(latent.state[~ended], np.asarray(every)[~ended])
+        assert len(np.unique(latent.state[ended], axis=0)) > 1
 
 
 def test_starts_that_end_an_episode_are_drawn_last_and_none_twice(drawn):
@@ -244,6 +254,7 @@ def imagine(
         lambda features, available: MaskedCategorical.of(logits, available),
         Discrete(3),
         ImaginationConfig(**options),
+        WorldModelConfig(),
         model.critic_features,
     )
     return imagine_trajectory(dream, start, jnp.float32(weight), jax.random.key(seed), step)
@@ -301,6 +312,39 @@ def test_nobody_comes_back_to_life_in_imagination(count, alive, expected, sample
     # The model's mode counts, at logits of 0.1 and -0.1, never a sample.
     trajectory = imagine(at(count, alive=alive), horizon=5, sample_availability=sample)
     assert_array_equal(trajectory.view.alive, expected)
+
+
+class Mortal(Clockwork):
+    """A world model in which each agent dies with probability 0.2 a step, and agent 0 alone says
+    that the episode ends, with probability 0.5."""
+
+    def predict(self, latent):
+        return (
+            super()
+            .predict(latent)
+            ._replace(alive=jnp.full(2, jnp.log(4.0)), terminated=jnp.array([0.0, -99.0]))
+        )
+
+
+@pytest.mark.parametrize(("sample", "share"), [(True, 0.8), (False, 1.0)])
+def test_imagined_death_is_a_latched_sample_or_the_mode(sample, share):
+    lives = [
+        np.asarray(imagine(at(0), Mortal(), seed=s, horizon=3, sample_life=sample).view.alive)
+        for s in range(60)
+    ]
+    lives = np.stack(lives)  # [S, H, N]
+    assert lives[:, 0].all()
+    assert not (lives[:, 2] & ~lives[:, 1]).any()  # nobody comes back
+    assert abs(lives[:, 1].mean() - share) < 0.1
+    assert abs(lives[:, 2].mean() - share**2) < 0.12
+
+
+@pytest.mark.parametrize(("team_end", "goes_on"), [(False, [0.5, 1.0]), (True, [0.75, 0.75])])
+def test_imagined_episodes_end_for_each_agent_or_for_the_team(team_end, goes_on):
+    trajectory = imagine(at(0), Mortal(), horizon=4, team_end=team_end)
+    goes_on = np.array(goes_on)
+    assert_allclose(trajectory.continues, [goes_on] * 3, rtol=1e-6)
+    assert_allclose(trajectory.weight, [np.ones(2), goes_on, goes_on**2], rtol=1e-6)
 
 
 def test_no_gradient_flows_through_imagination():

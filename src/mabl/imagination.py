@@ -15,7 +15,7 @@ from mabl.errors import require_between, require_positive
 from mabl.nets.categorical import still
 from mabl.nets.mlp import Features
 from mabl.types import PRNGKey, TeamView, Trajectory
-from mabl.world_models.base import WorldModel
+from mabl.world_models.base import WorldModel, WorldModelConfig, predict_step
 from mabl.world_models.heads import Predictions
 
 L = TypeVar("L")
@@ -33,6 +33,12 @@ class ImaginationConfig:
     """Start states drawn from the posterior states of a batch; None: all, as in the paper."""
     sample_availability: bool = True
     """Sample the availability of imagined actions, as in the paper, or take its mode."""
+    sample_life: bool = False
+    """Sample who dies in imagination, or take the mode, by which a risk below one half kills
+    nobody."""
+    team_end: bool = False
+    """End imagined episodes for the team at once, with the mean of the agents' probabilities of
+    termination; for environments whose episodes do so."""
 
     def __post_init__(self) -> None:
         require_positive(self, "n_starts")
@@ -54,6 +60,7 @@ class Dream(NamedTuple):
     actor: ActorFunction
     action_space: ActionSpace
     config: ImaginationConfig
+    model_config: WorldModelConfig
     critic_features: Callable[[Any], Features]
     """Of a latent, what only training sees."""
 
@@ -69,9 +76,9 @@ class Dream(NamedTuple):
 
         Nobody comes back to life.
         """
-        key_latent, key_available = jax.random.split(key)
+        key_latent, key_available, key_alive = jax.random.split(key, 3)
         latent = self.model.imagine(state.latent, self.action_space.encode(action), key_latent)
-        predicted = self.model.predict(latent)
+        predicted = predict_step(self.model, state.latent, latent, self.model_config)
         available = state.available  # dimensions of continuous actions come and go for nobody
         if isinstance(self.action_space, Discrete):
             threshold = (
@@ -80,7 +87,16 @@ class Dream(NamedTuple):
                 else 0.5
             )
             available = jax.nn.sigmoid(predicted.available) > threshold
-        return Imagined(latent, available, state.alive & (predicted.alive > 0)), predicted
+        drawn = jax.random.uniform(key_alive, state.alive.shape) if self.config.sample_life else 0.5
+        alive = state.alive & (jax.nn.sigmoid(predicted.alive) > drawn)
+        return Imagined(latent, available, alive), predicted
+
+    def continues(self, predicted: Predictions) -> Float[Array, " N"]:
+        """Each agent's probability that the episode goes on after a row."""
+        terminated = jax.nn.sigmoid(predicted.terminated)
+        if self.config.team_end:
+            terminated = jnp.broadcast_to(terminated.mean(), terminated.shape)
+        return 1 - terminated
 
     def view(self, state: Imagined) -> TeamView:
         """What learning to act sees of a state."""
@@ -110,7 +126,7 @@ def imagine_trajectory(
         key_action, key_step = jax.random.split(key)
         action, log_prob = dream.act(state, key_action)
         after, predicted = step(dream, state, action, key_step)
-        continues = 1 - jax.nn.sigmoid(predicted.terminated)
+        continues = dream.continues(predicted)
         return after, (dream.view(state), action, log_prob, predicted.reward, continues)
 
     keys = jax.random.split(key, dream.config.horizon - 1)

@@ -65,7 +65,7 @@ def test_the_dead_do_not_count_in_what_is_said_of_observations():
 
     @jax.jit
     def told(rows: TimeStep) -> Metrics:
-        return diagnose(model, latents, rows, jax.random.key(5), spec.action_space)
+        return diagnose(model, latents, rows, jax.random.key(5), spec.action_space, config)
 
     dead = jnp.where(rows.alive[..., None], rows.obs, 99.0)
     living = jnp.where(rows.alive[..., None], 99.0, rows.obs)

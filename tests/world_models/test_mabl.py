@@ -559,19 +559,20 @@ def test_overshooting_trains_the_decoders_on_what_the_prior_predicts():
     )
     without = rigged_loss(batched(rows))
     terms = rigged_loss(batched(rows), overshooting=0.5, obs_weight=2.0)
-    # Everything predicted is 1. Huber of 0, 1, 1, 1 and of 2, 0, 1, 1: 1.5 and 2.5, times 0.5 * 2
-    assert_allclose(terms["ahead_obs"], 2.0, rtol=1e-5)
-    # Huber of 1, 1, 1 and of 1, 0.5, 1
-    assert_allclose(terms["ahead_reward"], 0.5 * (5 * 0.5 + 0.125) / 6, rtol=1e-5)
-    # Two of six terminated: log(1 + e) without, log(1 + 1/e) with
+    # The first row is a reset: it follows nothing, so that only the second of two rows counts.
+    # Everything predicted is 1. Huber of 2, 0, 1, 1: 2.5, times 0.5 * 2
+    assert_allclose(terms["ahead_obs"], 2.5 / 2, rtol=1e-5)
+    # Huber of 1, 0.5, 1
+    assert_allclose(terms["ahead_reward"], 0.5 * (2 * 0.5 + 0.125) / 6, rtol=1e-5)
+    # Two of three terminated: log(1 + e) without, log(1 + 1/e) with
     assert_allclose(
         terms["ahead_terminated"],
-        0.5 * (4 * np.log1p(np.e) + 2 * np.log1p(1 / np.e)) / 6,
+        0.5 * (np.log1p(np.e) + 2 * np.log1p(1 / np.e)) / 6,
         rtol=1e-5,
     )
     assert_allclose(terms["obs"], 2 * without["obs"], rtol=1e-5)
     # All alive: log(1 + 1/e)
-    assert_allclose(terms["ahead_alive"], 0.5 * np.log1p(1 / np.e), rtol=1e-5)
+    assert_allclose(terms["ahead_alive"], 0.5 * np.log1p(1 / np.e) / 2, rtol=1e-5)
     for name in ("reward", "terminated", "available", "alive", "action", "kl_level"):
         assert terms[name] == without[name], name
     assert not any(name.startswith("ahead") for name in without)
@@ -604,10 +605,10 @@ def test_dead_agents_neither_teach_observations_nor_actions():
 def test_the_dead_do_teach_that_they_are_dead():
     rows = some_rows(2)._replace(alive=jnp.array([[True, True, False], [True, False, False]]))
     terms = rigged_loss(batched(rows), overshooting=1.0)
-    # Three of six alive: at logit 0 it makes no difference, at logit 1 log(1 + 1/e) for the living,
-    # log(1 + e) for the dead, in the mean 0.813262.
+    # At logit 0 it makes no difference; at logit 1 it is log(1 + 1/e) for the one that lives on the
+    # second row and log(1 + e) for the two that do not, and the first row does not count.
     assert_allclose(terms["alive"], np.log(2), rtol=1e-5)
-    assert_allclose(terms["ahead_alive"], 0.813262, rtol=1e-5)
+    assert_allclose(terms["ahead_alive"], (0.313262 + 2 * 1.313262) / 6, rtol=1e-5)
 
 
 def test_losses_of_the_decoders_are_told_by_row_and_agent():

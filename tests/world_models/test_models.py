@@ -780,6 +780,7 @@ def choose(starts: list[int], **options) -> tuple[Imagined, Predictions]:
         lambda features, available: MaskedCategorical.of(jnp.array([-99.0, 99.0]), available),
         Discrete(2),
         ImaginationConfig(),
+        WorldModelConfig(),
         lambda latent: jnp.zeros((2, 1)),
     )
     # Linear networks that repeat what they see

@@ -11,10 +11,17 @@ from mabl.envs.base import ActionSpace
 from mabl.nets.categorical import still
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey
-from mabl.world_models.base import WorldModel
+from mabl.world_models.base import (
+    WorldModel,
+    WorldModelConfig,
+    followers,
+    predict_sequence,
+    predict_step,
+)
 from mabl.world_models.heads import Predictions
 
 L = TypeVar("L")
+T = TypeVar("T")
 
 OPEN_LOOP_STEPS = (1, 5, 15)
 DIAGNOSED_ROWS = max(OPEN_LOOP_STEPS) + 5
@@ -22,17 +29,26 @@ DIAGNOSED_ROWS = max(OPEN_LOOP_STEPS) + 5
 
 
 def diagnose(
-    model: WorldModel[L], latents: L, rows: TimeStep, key: PRNGKey, action_space: ActionSpace
+    model: WorldModel[L],
+    latents: L,
+    rows: TimeStep,
+    key: PRNGKey,
+    action_space: ActionSpace,
+    config: WorldModelConfig,
 ) -> Metrics:
     """Diagnostics on real sequences `[B, T]`, T > 15, and their posterior latents.
 
-    `posterior` metrics decode the latent that has seen the row; `prior` ones the latent predicted
-    for it one step before. Open-loop errors predict k steps ahead from real actions alone, and are
-    relative: 1 is as bad as always predicting the mean, 0 is perfect. Everything stays within
-    episodes; observations are those of the living.
+    `posterior` metrics decode the latent that has seen the row (rewards and terminations: what
+    `config.outcomes` says); `prior` ones the latent predicted for it one step before. Open-loop
+    errors predict k steps ahead from real actions alone, and are relative: 1 is as bad as always
+    predicting the mean, 0 is perfect. Everything stays within episodes; observations are those of
+    the living.
     """
     everywhere = jnp.ones_like(rows.alive)
-    posterior = jax.vmap(jax.vmap(model.predict))(latents)
+    outcomes = everywhere
+    if config.outcomes == "transition":
+        outcomes = everywhere & swapped(followers(swapped(rows.is_first)))[..., None]
+    posterior = swapped(predict_sequence(model, swapped(latents), config))
     wins = jnp.nan_to_num(rows.score) > 0
     metrics = {
         "world_model/reconstruction": masked_mean(
@@ -40,14 +56,16 @@ def diagnose(
         ),
         "world_model/obs_unexplained_posterior": unexplained(posterior.obs, rows.obs, rows.alive),
         "world_model/reward_unexplained_posterior": unexplained(
-            posterior.reward[..., None], rows.reward[..., None], everywhere
+            posterior.reward[..., None], rows.reward[..., None], outcomes
         ),
         "world_model/reward_on_wins": masked_mean(posterior.reward.mean(-1), wins),
         "world_model/reward_on_wins_real": masked_mean(rows.reward.mean(-1), wins),
-        "world_model/terminated_accuracy": ((posterior.terminated > 0) == rows.terminated).mean(),
+        "world_model/terminated_accuracy": masked_mean(
+            (posterior.terminated > 0) == rows.terminated, outcomes
+        ),
         "world_model/available_accuracy": ((posterior.available > 0) == rows.available).mean(),
     }
-    ahead = open_loop(model, latents, rows, key, action_space, max(OPEN_LOOP_STEPS))
+    ahead = open_loop(model, latents, rows, key, action_space, config, max(OPEN_LOOP_STEPS))
     ahead_reward, reward = ahead.reward[..., None], rows.reward[..., None]
     for k in OPEN_LOOP_STEPS:
         metrics[f"world_model/open_loop_obs_{k}"] = open_loop_error(
@@ -60,12 +78,18 @@ def diagnose(
     return metrics
 
 
+def swapped(tree: T) -> T:
+    """The two leading axes of all arrays exchanged: batch and time."""
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), tree)
+
+
 def open_loop(
     model: WorldModel,
     latents: object,
     rows: TimeStep,
     key: PRNGKey,
     action_space: ActionSpace,
+    config: WorldModelConfig,
     steps: int,
 ) -> Predictions:
     """Predictions `[K, B, T - K, N, ...]`: entry (k, b, t) is for row t + k + 1, from row t."""
@@ -75,8 +99,8 @@ def open_loop(
 
     def one(latent: object, actions: Array, key: PRNGKey) -> Predictions:
         def step(latent: object, at: tuple[Array, PRNGKey]) -> tuple[object, Predictions]:
-            latent = model.imagine(latent, *at)
-            return latent, model.predict(latent)
+            after = model.imagine(latent, *at)
+            return after, predict_step(model, latent, after, config)
 
         return jax.lax.scan(step, latent, (actions, jax.random.split(key, steps)))[1]
 

@@ -18,7 +18,7 @@ from mabl.nets.mlp import MLP, Features, parts_of, widths_of
 from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
 from mabl.types import Metrics, PRNGKey, Progress, Replayed, Trajectory
-from mabl.world_models.base import decoder_losses, kl_losses, observe_batch
+from mabl.world_models.base import decoder_losses, kl_losses, observe_batch, predict_sequence
 from mabl.world_models.heads import Predictions
 from mabl.world_models.mamba import Team
 
@@ -88,7 +88,7 @@ class MAG(NamedTuple):
         )
         rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)
         observed = observe_batch(base.model, rows, key_observe)
-        predicted = jax.vmap(jax.vmap(base.model.predict))(observed.latents)
+        predicted = predict_sequence(base.model, observed.latents, config)
         losses = decoder_losses(predicted, rows, config, self.spec.action_space)
         realised = sum(losses[name] for name in ("obs", "reward", "terminated", "available")) + sum(
             kl_losses(observed, config).values()

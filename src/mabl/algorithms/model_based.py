@@ -135,7 +135,14 @@ class ModelBased(NamedTuple):
         key_sample, key_observe, key_diagnose = jax.random.split(key, 3)
         rows = sample_sequences(replay, key_sample, N_DIAGNOSED, DIAGNOSED_ROWS)
         latents = self._observe(learner, rows, key_observe)
-        metrics = diagnose(learner.model, latents, rows, key_diagnose, self.spec.action_space)
+        metrics = diagnose(
+            learner.model,
+            latents,
+            rows,
+            key_diagnose,
+            self.spec.action_space,
+            self.config.world_model,
+        )
 
         def value(latent: Any, row: TimeStep) -> Array:
             view = self.view(learner.model, latent, row.available, row.alive)
@@ -154,6 +161,7 @@ class ModelBased(NamedTuple):
             self.behaviour.actor(learner.behaviour),
             self.spec.action_space,
             self.config.imagination,
+            self.config.world_model,
             lambda latent: self.behaviour.critic_features(learner.model, latent),
         )
 
@@ -181,14 +189,17 @@ def starts(
 ) -> tuple[Imagined, Float[Array, " S"]]:
     """Where imagination begins, `[S, ...]`, and 0 where the row ends an episode.
 
-    All posterior states of the batch `[B, T]`, or `n_starts` of them drawn without replacement,
-    rows that do not end an episode first. Availability and life are the real ones.
+    All posterior states of the batch `[B, T]`, those that end an episode replaced by others at
+    random; or `n_starts` of them drawn without replacement, rows that do not end an episode first.
+    Availability and life are the real ones.
     """
     states = Imagined(latents, rows.available, rows.alive)
     states, weight = jax.tree.map(
         lambda x: rearrange(x, "b t ... -> (b t) ..."), (states, 1.0 - is_last(rows))
     )
     if n_starts is None:
-        return states, weight
+        spare = jax.random.categorical(key, jnp.log(weight), shape=weight.shape)
+        order = jnp.where(weight > 0, jnp.arange(weight.shape[0]), spare)
+        return jax.tree.map(lambda x: x[order], (states, weight))
     order = jnp.argsort(jax.random.uniform(key, weight.shape) - 2 * weight)[:n_starts]
     return jax.tree.map(lambda x: x[order], (states, weight))

@@ -7,16 +7,17 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import ActionSpace, Discrete
-from mabl.errors import UserError, require_between, require_positive
+from mabl.errors import require_between, require_positive
 from mabl.losses.kl import balanced_kl, categorical_kl
-from mabl.nets.categorical import CodeShape
+from mabl.nets.categorical import CodeShape, still
 from mabl.nets.mlp import Features
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey
 from mabl.world_models.heads import Predictions
+from mabl.world_models.levels import arriving
 
 L = TypeVar("L")
 
@@ -40,6 +41,10 @@ class WorldModelConfig:
     models of one level have none."""
     obs_weight: float = 1.0
     """Weight of the observations' loss."""
+    outcomes: Literal["row", "transition"] = "row"
+    """What rewards and terminations are predicted from: the row's own latent (z_t, h_t) as in the
+    paper, or (z_{t-1}, h_t), which the row's observation has not reached yet: all that imagination
+    has (as in MAMBA's code)."""
     reward_input: Literal["agent", "both"] = "agent"
     """What imagination's reward predictor sees: (z_agent, h_agent) as in the paper, or both levels,
     where there are two; then the agent's own predictor is trained beside it."""
@@ -47,6 +52,10 @@ class WorldModelConfig:
     """Likelihood of the reward: smooth L1 with delta 1, or half the squared error."""
     reward_weight: float = 1.0
     """Weight of the reward's loss: what pays is a small part of what is seen."""
+    end_weight: float = 1.0
+    """Weight of the losses of termination and of life."""
+    absorbing: int = 0
+    """Steps imagined past true ends, where reward 0 and termination are taught; 0 in the paper."""
     agent_reward_weight: float = 1.0
     """Weight of the agent's own reward predictor, relative, where `reward_input` is both levels."""
     kl_reduction: Literal["mean", "sum"] = "mean"
@@ -81,12 +90,8 @@ class WorldModelConfig:
         require_between(self, 2, inf, "batch_length")
         require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
         require_between(self, 0, inf, "free_nats", "obs_weight", "overshooting")
-        require_between(self, 0, inf, "reward_weight", "agent_reward_weight")
-        if self.overshooting and self.agent_prior_input == "posterior":
-            raise UserError(
-                "--world-model.overshooting decodes what imagination would draw: give it 0, or "
-                "--world-model.agent-prior-input prior"
-            )
+        require_between(self, 0, inf, "reward_weight", "agent_reward_weight", "end_weight")
+        require_between(self, 0, inf, "absorbing")
 
 
 class WorldModel(Protocol[L]):
@@ -159,19 +164,35 @@ def model_loss(
 
     L_ELBO = -log p(o^i | h^a, z^a) + KL(q(z^a | .) || p(z^a | .)) + KL(q(z^g | .) || p(z^g | .)),
     the KLs balanced (`losses/kl.py`); the other terms are those of `decoder_losses`. `rows` are
-    `[B, T, ...]`. Losses are sums over features and means over B, T and N. With
-    `config.overshooting` the decoders also see the latent that the prior predicts for each row from
-    the row before (at a first row, from nothing): what imagination decodes and the KL alone trains.
+    `[B, T, ...]`. Losses are sums over features and means over B, T and N.
+
+    A sequence may begin in the middle of an episode, whose past the model cannot know: its first
+    row's KL does not count. With `config.overshooting` the decoders also see the latent that the
+    prior predicts for each row from the row before, which imagination decodes and the KL alone
+    trains; rows whose row before is unknown or of another episode do not count there. With
+    `config.absorbing` the model also learns that nothing follows an end (`absorbing_loss`).
     """
     rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)  # as the scan over time leaves them
     observed = observe_batch(model, rows, key, train=True)
-    predicted = jax.vmap(jax.vmap(model.predict))(observed.latents)
-    losses = decoder_losses(predicted, rows, config, action_space)
+    follows = followers(rows.is_first)[..., None]
+    losses = decoder_losses(
+        predict_sequence(model, observed.latents, config), rows, config, action_space
+    )
+    if config.outcomes == "transition":
+        losses |= {name: follows * losses[name] for name in OUTCOMES if name in losses}
     if config.overshooting:
         ahead = jax.vmap(jax.vmap(model.predict))(observed.prior_latents)
         for name, loss in decoder_losses(ahead, rows, config, action_space).items():
-            losses[f"ahead_{name}"] = config.overshooting * loss
-    losses |= kl_losses(observed, config)
+            if config.outcomes == "row" or name not in OUTCOMES:
+                losses[f"ahead_{name}"] = config.overshooting * follows * loss
+    known = follows | rows.is_first[..., None]
+    for name, loss in kl_losses(observed, config).items():
+        losses[name] = loss * (known if loss.ndim > 2 else known[..., 0])
+    if config.absorbing:
+        key_absorbing = jax.random.fold_in(key, 1)
+        losses["absorbing"] = absorbing_loss(
+            model, observed.latents, rows, key_absorbing, config, action_space
+        )
     means = {name: loss.mean() for name, loss in losses.items()}
     total = jnp.stack(list(means.values())).sum()
     metrics = {f"world_model/loss_{name}": value for name, value in means.items()}
@@ -180,6 +201,83 @@ def model_loss(
         nats = categorical_kl(posterior, observed.prior[level]).sum(-1).mean()
         metrics[f"world_model/kl_{level}"] = nats
     return total, metrics
+
+
+OUTCOMES = ("reward", "agent_reward", "terminated")
+"""Losses of what a transition brings: `WorldModelConfig.outcomes`."""
+
+
+def followers(is_first: Bool[Array, "T B"]) -> Bool[Array, "T B"]:
+    """Mask of the rows of time-first sequences whose row before is known and of their episode."""
+    inside = jnp.arange(is_first.shape[0])[:, None] > 0
+    return inside & ~is_first
+
+
+def predict_step(
+    model: WorldModel[L], before: L, after: L, config: WorldModelConfig
+) -> Predictions:
+    """Predictions of a row from its latent and the latent of the row before; no batch axis."""
+    predicted = model.predict(after)
+    if config.outcomes == "row":
+        return predicted
+    came = model.predict(arriving(before, after))
+    return predicted._replace(**{name: getattr(came, name) for name in OUTCOMES})
+
+
+def predict_sequence(model: WorldModel[L], latents: L, config: WorldModelConfig) -> Predictions:
+    """Predictions of the rows of time-first latents `[T, B, ...]`.
+
+    With outcomes of the transition, those of rows that have no row before mean nothing.
+    """
+    before = jax.tree.map(lambda x: jnp.concatenate([x[:1], x[:-1]]), latents)
+    return jax.vmap(jax.vmap(lambda a, b: predict_step(model, a, b, config)))(before, latents)
+
+
+def absorbing_loss(
+    model: WorldModel,
+    latents: Any,
+    rows: TimeStep,
+    key: PRNGKey,
+    config: WorldModelConfig,
+    action_space: ActionSpace,
+) -> Float[Array, "B N"]:
+    """Losses of reward 0 and of termination on steps imagined past the end of an episode.
+
+    The replay holds no row that follows an end: the next one is a reset. MAMBA stores absorbing
+    rows instead. The first true end of each sequence `[T, B, ...]` is continued by
+    `config.absorbing` random joint actions; losses are divided by T, so that a step past an end
+    counts as much as a replayed row.
+    """
+    ended = rows.terminated.all(-1)
+    length, batch = ended.shape
+    first, there = ended.argmax(0), ended.any(0)
+    start = jax.tree.map(lambda x: x[first, jnp.arange(batch)], latents)
+
+    def past(latent: Any, key: PRNGKey) -> Float[Array, " N"]:
+        def step(latent: Any, key: PRNGKey) -> tuple[Any, Float[Array, " N"]]:
+            key_action, key_latent = jax.random.split(key)
+            action = action_space.encode(random_action(action_space, rows, key_action))
+            after = model.imagine(latent, action, key_latent)
+            said = predict_step(model, latent, after, config)
+            loss = config.reward_weight * reward_loss(
+                said.reward, jnp.zeros_like(said.reward), config.reward_loss
+            ) + config.end_weight * optax.sigmoid_binary_cross_entropy(
+                said.terminated, jnp.ones_like(said.terminated)
+            )
+            return still(after), loss
+
+        return jax.lax.scan(step, still(latent), jax.random.split(key, config.absorbing))[1].sum(0)
+
+    losses = jax.vmap(past)(start, jax.random.split(key, batch))
+    return there[:, None] * losses / length
+
+
+def random_action(space: ActionSpace, rows: TimeStep, key: PRNGKey) -> Array:
+    """A joint action at random, whether available or not."""
+    shape = rows.prev_action.shape[2:]
+    if isinstance(space, Discrete):
+        return jax.random.randint(key, shape, 0, space.n)
+    return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
 
 class Observed(NamedTuple):
@@ -237,13 +335,14 @@ def decoder_losses(
         "obs": config.obs_weight * (alive * optax.huber_loss(predicted.obs, rows.obs).sum(-1)),
         "reward": config.reward_weight
         * reward_loss(predicted.reward, rows.reward, config.reward_loss),
-        "terminated": optax.sigmoid_binary_cross_entropy(
+        "terminated": config.end_weight
+        * optax.sigmoid_binary_cross_entropy(
             predicted.terminated, rows.terminated.astype(jnp.float32)
         ),
         "available": optax.sigmoid_binary_cross_entropy(
             predicted.available, rows.available.astype(jnp.float32)
         ).sum(-1),
-        "alive": optax.sigmoid_binary_cross_entropy(predicted.alive, alive),
+        "alive": config.end_weight * optax.sigmoid_binary_cross_entropy(predicted.alive, alive),
         "action": acted * action_loss(predicted.action, rows.prev_action, action_space),
     }
     if predicted.agent_reward is not None:

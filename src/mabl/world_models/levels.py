@@ -80,6 +80,18 @@ def forget(past: Tree, is_first: Bool[Array, ""]) -> Tree:
     return jax.tree.map(zeros, past, is_leaf=lambda x: isinstance(x, Code))
 
 
+def arriving(before: Tree, after: Tree) -> Tree:
+    """Latent of a transition: z of the row before, h of the row after, at every level.
+
+    It knows the action and the past, and nothing that the row after shows.
+    """
+
+    def mix(before: Any, after: Any) -> Any:
+        return Level(after.h, before.z) if isinstance(after, Level) else after
+
+    return jax.tree.map(mix, before, after, is_leaf=lambda x: isinstance(x, Level))
+
+
 class AgentFilter(eqx.Module):
     """What an agent runs to know where it is: from its own observations and actions alone.
 

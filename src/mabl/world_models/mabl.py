@@ -74,13 +74,17 @@ class MABL(eqx.Module):
         """Prior latent of the row whose embeddings `latent` holds, and its logits by level.
 
         p(z^g_t | h^g_t) and p(z^a_t | h^a_t, z^g_t) with z^g_t a sample of the global prior
-        (section 3.2; `config.agent_prior_input` can make it the posterior sample of appendix A).
+        (section 3.2). `config.agent_prior_input` can have the agent's logits, which the KL compares
+        with the posterior, see the posterior sample of z^g_t instead (appendix A); the latent is
+        what imagination draws in both cases.
         """
         by_posterior = self.config.agent_prior_input == "posterior"
 
         def prior_agent(latent: Latent, key: PRNGKey) -> tuple[Latent, dict[str, Array]]:
-            given = latent.global_.z if by_posterior else None
-            return self._transition(latent.agent.h, latent.global_.h, key, given)
+            prior, logits = self._transition(latent.agent.h, latent.global_.h, key)
+            if by_posterior:
+                logits["agent"] = self.nets.agent_prior(latent.agent.h, latent.global_.z)
+            return prior, logits
 
         return jax.vmap(prior_agent)(latent, jax.random.split(key, self.spec.n_agents))
 
@@ -104,18 +108,15 @@ class MABL(eqx.Module):
         h_agent: Float[Array, " D"],
         h_global: Float[Array, " D"],
         key: PRNGKey,
-        z_global: Code | None = None,
     ) -> tuple[Latent, dict[str, Float[Array, "K C"]]]:
         """One agent's transition model (section 3.1.1): a sample and its logits.
 
         z^g_t ~ p(z^g_t | h^g_t),   z^a_t ~ p(z^a_t | h^a_t, z^g_t)
-
-        The agent's prior sees `z_global` if given, else the global sample.
         """
         key_agent, key_global = jax.random.split(key)
         global_logits = self.nets.global_prior(h_global)
         sample = draw(global_logits, key_global)
-        agent_logits = self.nets.agent_prior(h_agent, sample if z_global is None else z_global)
+        agent_logits = self.nets.agent_prior(h_agent, sample)
         agent = Level(h_agent, draw(agent_logits, key_agent))
         return Latent(agent, Level(h_global, sample)), {
             "agent": agent_logits,

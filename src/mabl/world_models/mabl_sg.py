@@ -65,10 +65,13 @@ class MABLSG(eqx.Module):
     def prior(self, latent: Latent, key: PRNGKey) -> tuple[Latent, dict[str, Array]]:
         """z^g_t ~ p(z^g_t | h^g_t), and every agent's z^a_t ~ p(z^a_t | h^a_t, z^g_t).
 
-        `config.agent_prior_input` says which z^g the agents' priors see, as in MABL.
+        `config.agent_prior_input` says which z^g the agents' logits see, as in MABL.
         """
-        given = latent.global_.z if self.config.agent_prior_input == "posterior" else None
-        return self._transition(latent, key, given)
+        prior, logits = self._transition(latent, key)
+        if self.config.agent_prior_input == "posterior":
+            agent_prior = jax.vmap(self.nets.agent_prior, in_axes=(0, None))
+            logits["agent"] = agent_prior(latent.agent.h, latent.global_.z)
+        return prior, logits
 
     def imagine(self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey) -> Latent:
         """Prior latents of the next row after the joint (encoded) action."""
@@ -77,15 +80,13 @@ class MABLSG(eqx.Module):
         moved = Latent(latent.agent._replace(h=h_agent), latent.global_._replace(h=h_global))
         return still(self._transition(moved, key)[0])
 
-    def _transition(
-        self, latent: Latent, key: PRNGKey, z_global: Code | None = None
-    ) -> tuple[Latent, dict[str, Array]]:
+    def _transition(self, latent: Latent, key: PRNGKey) -> tuple[Latent, dict[str, Array]]:
         """Samples and logits given the deterministic parts of `latent`."""
         key_agents, key_global = jax.random.split(key)
         global_logits = self.nets.global_prior(latent.global_.h)
         global_ = Level(latent.global_.h, draw(global_logits, key_global))
-        seen = global_.z if z_global is None else z_global
-        agent_logits = jax.vmap(self.nets.agent_prior, in_axes=(0, None))(latent.agent.h, seen)
+        agent_prior = jax.vmap(self.nets.agent_prior, in_axes=(0, None))
+        agent_logits = agent_prior(latent.agent.h, global_.z)
         agent = Level(latent.agent.h, draw(agent_logits, key_agents))
         return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
 
