@@ -160,12 +160,14 @@ class Oracle(NamedTuple):
         rows = replay._replace(rows=replay.rows.row)
         progress = state.env_steps / total_steps
         experience = Experience(rows, None, None, progress)  # pyright: ignore[reportArgumentType]
-        learner, model_metrics = repeat(
-            lambda learner, key: self.algorithm.update_model(learner, experience, key),
-            state.learner,
-            key_model,
-            n_model,
-        )
+        learner, model_metrics = state.learner, {}
+        if self.parts.model:
+            learner, model_metrics = repeat(
+                lambda learner, key: self.algorithm.update_model(learner, experience, key),
+                learner,
+                key_model,
+                n_model,
+            )
 
         def update_policy(learner: Learner, key: PRNGKey) -> tuple[Learner, Metrics]:
             key_imagine, key_learn = jax.random.split(key)
