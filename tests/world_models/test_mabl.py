@@ -478,6 +478,7 @@ class Rigged(eqx.Module):
 
     n_agents: int = eqx.field(static=True)
     agent_reward: bool = eqx.field(static=True, default=False)
+    filter: None = None
 
     def initial(self):
         return jnp.zeros(self.n_agents)

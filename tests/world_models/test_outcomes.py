@@ -75,6 +75,8 @@ class Fixed(eqx.Module):
     Its prior differs from its posterior by a known KL in every row.
     """
 
+    filter: None = None
+
     def initial(self):
         return jnp.zeros(3)
 

@@ -18,7 +18,13 @@ from mabl.nets.mlp import MLP, Features, parts_of, widths_of
 from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
 from mabl.types import Metrics, PRNGKey, Progress, Replayed, Trajectory
-from mabl.world_models.base import decoder_losses, kl_losses, observe_batch, predict_sequence
+from mabl.world_models.base import (
+    decoder_losses,
+    kl_losses,
+    obs_std,
+    observe_batch,
+    predict_sequence,
+)
 from mabl.world_models.heads import Predictions
 from mabl.world_models.mamba import Team
 
@@ -89,7 +95,9 @@ class MAG(NamedTuple):
         rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)
         observed = observe_batch(base.model, rows, key_observe)
         predicted = predict_sequence(base.model, observed.latents, config)
-        losses = decoder_losses(predicted, rows, config, self.spec.action_space)
+        losses = decoder_losses(
+            predicted, rows, config, self.spec.action_space, obs_std(base.model)
+        )
         realised = sum(losses[name] for name in ("obs", "reward", "terminated", "available")) + sum(
             kl_losses(observed, config).values()
         )

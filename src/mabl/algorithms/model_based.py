@@ -23,7 +23,13 @@ from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
 from mabl.rows import TimeStep, is_last
 from mabl.types import Metrics, PRNGKey, Progress, Replayed, TeamView, Trajectory
-from mabl.world_models.base import WorldModel, WorldModelConfig, model_loss, observe_sequence
+from mabl.world_models.base import (
+    WorldModel,
+    WorldModelConfig,
+    model_loss,
+    observe_sequence,
+    with_scales,
+)
 
 N_DIAGNOSED = 128
 """Sequences that diagnostics look at."""
@@ -79,12 +85,13 @@ class ModelBased(NamedTuple):
         rows = sample_sequences(
             experience.replay, key_sample, config.batch_size, config.batch_length
         )
+        model = with_scales(learner.model, rows)
         gradient, metrics = eqx.filter_grad(model_loss, has_aux=True)(
-            learner.model, rows, key_loss, config, self.spec.action_space
+            model, rows, key_loss, config, self.spec.action_space
         )
         step, model_opt = self._optimiser().update(gradient, learner.model_opt)
         metrics["world_model/gradient_norm"] = optax.tree.norm(gradient)
-        model = eqx.apply_updates(learner.model, step)
+        model = eqx.apply_updates(model, step)
         return learner._replace(model=model, model_opt=model_opt), metrics
 
     def update_policy(

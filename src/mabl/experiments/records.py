@@ -19,7 +19,15 @@ from mabl.runs.checkpoint import Checkpoints
 from mabl.runs.folder import read_config
 from mabl.runs.metrics import read, score_name
 
-NO_PARAMETERS = ("opt.", "target.", ".returns.", ".ent_coef", ".epsilon")
+NO_PARAMETERS = (
+    "opt.",
+    "target.",
+    ".returns.",
+    ".scale.",
+    ".state_scale.",
+    ".ent_coef",
+    ".epsilon",
+)
 """In names of what a learner has beside the parameters of its networks."""
 
 

@@ -1,8 +1,8 @@
-"""Fully connected networks with ReLU activations (appendix B.1)."""
+"""Fully connected networks, with ReLU (appendix B.1) or RMS normalisation and SiLU [DreamerV3]."""
 
 from itertools import accumulate, pairwise
 from math import prod
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -69,13 +69,29 @@ class Linear(eqx.Module):
         return total
 
 
+Activation = Literal["relu", "rms_silu"]
+"""Function of hidden layers: ReLU, or RMS normalisation followed by SiLU."""
+
+
+def activate(x: Float[Array, "*b D"], activation: Activation) -> Float[Array, "*b D"]:
+    """Output of a hidden layer from its linear part.
+
+    RMS normalisation divides by the root of the mean square over features [Zhang and Sennrich
+    2019]; a gain would be one with the weights of the next layer but for SiLU, and is left out.
+    """
+    if activation == "relu":
+        return jax.nn.relu(x)
+    return jax.nn.silu(x * jax.lax.rsqrt((x * x).mean(-1, keepdims=True) + 1e-4))
+
+
 class MLP(eqx.Module):
-    """`n_hidden` ReLU layers of width `hidden`, then a linear layer to `n_out`.
+    """`n_hidden` hidden layers of width `hidden`, then a linear layer to `n_out`.
 
     `out_scale` shrinks the last layer's initial weights: 0.01 makes an actor start uniform.
     """
 
     layers: list[Linear]
+    activation: Activation = eqx.field(static=True)
 
     def __init__(
         self,
@@ -85,7 +101,9 @@ class MLP(eqx.Module):
         n_hidden: int,
         key: PRNGKey,
         out_scale: float = 1.0,
+        activation: Activation = "relu",
     ):
+        self.activation = activation
         widths = [n_in, *[hidden] * n_hidden, n_out]
         scales = [1.0] * n_hidden + [out_scale]
         keys = jax.random.split(key, n_hidden + 1)
@@ -98,5 +116,9 @@ class MLP(eqx.Module):
         first, *rest = self.layers
         x = first(*parts)
         for layer in rest:
-            x = layer(jax.nn.relu(x))
+            x = layer(activate(x, self.activation))
         return x
+
+    def embed(self, *parts: Part) -> Float[Array, "*b O"]:
+        """Apply, and activate the output as one more hidden layer."""
+        return activate(self(*parts), self.activation)

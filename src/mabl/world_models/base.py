@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -13,13 +14,14 @@ from mabl.envs.base import ActionSpace, Discrete
 from mabl.errors import require_between, require_positive
 from mabl.losses.kl import balanced_kl, categorical_kl
 from mabl.nets.categorical import CodeShape, still
-from mabl.nets.mlp import Features
+from mabl.nets.mlp import Activation, Features
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey
 from mabl.world_models.heads import Predictions
 from mabl.world_models.levels import arriving
 
 L = TypeVar("L")
+M = TypeVar("M", bound=Any)
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,12 @@ class WorldModelConfig:
     agent_prior_input: Literal["prior", "posterior"] = "prior"
     """Global sample behind the agent prior in training (sec. 3.2: prior, app. A: posterior);
     models of one level have none."""
+    activation: Activation = "relu"
+    """Hidden layers of all networks: `relu` as in the paper (appendix B.1), or `rms_silu`: RMS
+    normalisation and SiLU, as in DreamerV3."""
+    standardise: bool = False
+    """Standardise observations and states by their running mean and variance, for encoders and for
+    the observations' loss."""
     obs_weight: float = 1.0
     """Weight of the observations' loss."""
     outcomes: Literal["row", "transition"] = "row"
@@ -175,14 +183,13 @@ def model_loss(
     rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)  # as the scan over time leaves them
     observed = observe_batch(model, rows, key, train=True)
     follows = followers(rows.is_first)[..., None]
-    losses = decoder_losses(
-        predict_sequence(model, observed.latents, config), rows, config, action_space
-    )
+    predicted, std = predict_sequence(model, observed.latents, config), obs_std(model)
+    losses = decoder_losses(predicted, rows, config, action_space, std)
     if config.outcomes == "transition":
         losses |= {name: follows * losses[name] for name in OUTCOMES if name in losses}
     if config.overshooting:
         ahead = jax.vmap(jax.vmap(model.predict))(observed.prior_latents)
-        for name, loss in decoder_losses(ahead, rows, config, action_space).items():
+        for name, loss in decoder_losses(ahead, rows, config, action_space, std).items():
             if config.outcomes == "row" or name not in OUTCOMES:
                 losses[f"ahead_{name}"] = config.overshooting * follows * loss
     known = follows | rows.is_first[..., None]
@@ -280,6 +287,32 @@ def random_action(space: ActionSpace, rows: TimeStep, key: PRNGKey) -> Array:
     return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
 
+SCALE_DECAY = 0.99
+"""Share of the running mean and variance of inputs that remains after a model update."""
+
+
+def with_scales(model: M, rows: TimeStep) -> M:
+    """Copy of a model that standardises its inputs, after it has seen `rows` `[*b, ...]`.
+
+    Observations of the dead do not count. A model without scales is returned as it is.
+    """
+    if getattr(model.filter, "scale", None) is None:
+        return model
+    scale = model.filter.scale.update(rows.obs, 1.0 * rows.alive, SCALE_DECAY)
+    model = eqx.tree_at(lambda m: m.filter.scale, model, scale)
+    if hasattr(model, "state_scale"):
+        everywhere = jnp.ones(rows.is_first.shape)
+        scale = model.state_scale.update(rows.state, everywhere, SCALE_DECAY)
+        model = eqx.tree_at(lambda m: m.state_scale, model, scale)
+    return model
+
+
+def obs_std(model: WorldModel) -> Float[Array, " O"] | float:
+    """Standard deviations by which errors of observations are divided; 1 without scales."""
+    scale = getattr(model.filter, "scale", None)
+    return 1.0 if scale is None else jax.lax.stop_gradient(scale.moments()[1])
+
+
 class Observed(NamedTuple):
     """What a model makes of real sequences: `[T, B, ...]`."""
 
@@ -321,18 +354,24 @@ def kl_losses(observed: Observed, config: WorldModelConfig) -> dict[str, Float[A
 
 
 def decoder_losses(
-    predicted: Predictions, rows: TimeStep, config: WorldModelConfig, action_space: ActionSpace
+    predicted: Predictions,
+    rows: TimeStep,
+    config: WorldModelConfig,
+    action_space: ActionSpace,
+    obs_std: Float[Array, " O"] | float = 1.0,
 ) -> dict[str, Float[Array, "*b N"]]:
     """-log likelihoods of rows `[*b, ...]` under what is decoded from their latents, weighted.
 
     -log p(o^i | z^a, h^a), -log p(r^i | z^a, h^a), and -log p(. | z^a, z^g, h^a, h^g) of
     termination, availability and the action a^i_{t-1} (sections 3.1.2 and 3.2), and of life
     (ADR 9). Observations and actions of the dead do not count, nor the action before a first row.
+    Errors of observations are in units of `obs_std`, by feature.
     """
     alive = rows.alive.astype(jnp.float32)
     acted = alive * ~rows.is_first[..., None]
     losses = {
-        "obs": config.obs_weight * (alive * optax.huber_loss(predicted.obs, rows.obs).sum(-1)),
+        "obs": config.obs_weight
+        * (alive * optax.huber_loss(predicted.obs / obs_std, rows.obs / obs_std).sum(-1)),
         "reward": config.reward_weight
         * reward_loss(predicted.reward, rows.reward, config.reward_loss),
         "terminated": config.end_weight

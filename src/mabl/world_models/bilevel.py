@@ -8,11 +8,12 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import EnvSpec
 from mabl.nets.mlp import MLP
+from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads
-from mabl.world_models.levels import AgentFilter, Categoricals, Level, Recurrent
+from mabl.world_models.levels import AgentFilter, Categoricals, Level, Recurrent, standardised
 
 
 class Latent(NamedTuple):
@@ -36,6 +37,8 @@ class BiLevel(eqx.Module):
 
     filter: AgentFilter
     state_encoder: MLP
+    state_scale: Normaliser | None
+    """Running mean and variance of the state, by which it is standardised."""
     global_recurrent: Recurrent
     global_posterior: Categoricals
     global_prior: Categoricals
@@ -47,13 +50,21 @@ class BiLevel(eqx.Module):
         keys = jax.random.split(key, 7)
         hidden, latent = config.hidden, config.latent
         action_dim = spec.action_space.size
-        self.filter = AgentFilter(spec.obs_dim, action_dim, hidden, latent, keys[0])
-        self.state_encoder = MLP(spec.state_dim, hidden, hidden, 2, keys[1])
-        self.global_recurrent = Recurrent(latent, spec.n_agents * action_dim, hidden, keys[2])
+        self.filter = AgentFilter(
+            spec.obs_dim, action_dim, hidden, latent, keys[0], config.standardise, config.activation
+        )
+        self.state_scale = Normaliser.fresh(spec.state_dim) if config.standardise else None
+        activation = config.activation
+        self.state_encoder = MLP(spec.state_dim, hidden, hidden, 2, keys[1], activation=activation)
+        self.global_recurrent = Recurrent(
+            latent, spec.n_agents * action_dim, hidden, keys[2], activation
+        )
         seen = latent._replace(n_categoricals=n_seen * latent.n_categoricals)
-        self.global_posterior = Categoricals((hidden, seen, hidden), hidden, latent, keys[3])
-        self.global_prior = Categoricals((hidden,), hidden, latent, keys[4])
-        self.agent_prior = Categoricals((hidden, latent), hidden, latent, keys[5])
+        self.global_posterior = Categoricals(
+            (hidden, seen, hidden), hidden, latent, keys[3], activation
+        )
+        self.global_prior = Categoricals((hidden,), hidden, latent, keys[4], activation)
+        self.agent_prior = Categoricals((hidden, latent), hidden, latent, keys[5], activation)
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, latent, hidden, hidden),
@@ -63,6 +74,7 @@ class BiLevel(eqx.Module):
             n_hidden=config.n_hidden,
             both_levels_reward=config.reward_input == "both",
             key=keys[6],
+            activation=activation,
         )
 
     def encode(self, row: TimeStep, spec: EnvSpec) -> Inputs:
@@ -70,6 +82,6 @@ class BiLevel(eqx.Module):
         return Inputs(
             prev_action=spec.action_space.encode(row.prev_action),
             obs=jax.vmap(self.filter.embed)(row.obs),
-            state=jax.nn.relu(self.state_encoder(row.state)),
+            state=self.state_encoder.embed(standardised(row.state, self.state_scale)),
             is_first=row.is_first,
         )

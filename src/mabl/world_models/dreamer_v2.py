@@ -13,7 +13,7 @@ from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads, Predictions
-from mabl.world_models.levels import AgentFilter, Categoricals, Level, forget, team_of
+from mabl.world_models.levels import AgentFilter, Categoricals, Level, forget, restored, team_of
 
 
 class Inputs(NamedTuple):
@@ -39,8 +39,16 @@ class DreamerV2(eqx.Module):
         keys = jax.random.split(key, 3)
         hidden, latent = config.hidden, config.latent
         self.spec = spec
-        self.filter = AgentFilter(spec.obs_dim, spec.action_space.size, hidden, latent, keys[0])
-        self.agent_prior = Categoricals((hidden,), hidden, latent, keys[1])
+        self.filter = AgentFilter(
+            spec.obs_dim,
+            spec.action_space.size,
+            hidden,
+            latent,
+            keys[0],
+            config.standardise,
+            config.activation,
+        )
+        self.agent_prior = Categoricals((hidden,), hidden, latent, keys[1], config.activation)
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, hidden),
@@ -50,6 +58,7 @@ class DreamerV2(eqx.Module):
             n_hidden=config.n_hidden,
             both_levels_reward=False,
             key=keys[2],
+            activation=config.activation,
         )
 
     def initial(self) -> Level:
@@ -86,7 +95,8 @@ class DreamerV2(eqx.Module):
 
     def predict(self, latent: Level) -> Predictions:
         """Decode a row for every agent from its own latent."""
-        return jax.vmap(self.heads)(latent.features(), latent.features())
+        predicted = jax.vmap(self.heads)(latent.features(), latent.features())
+        return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
 
     def actor_features(self, latent: Level) -> Features:
         """(z, h)."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mabl.nets.mlp import MLP, Features, Linear, Widths, parts_of
+from mabl.nets.mlp import MLP, Activation, Features, Linear, Widths, activate, parts_of
 from mabl.types import PRNGKey
 
 
@@ -56,12 +56,16 @@ class Heads(eqx.Module):
         n_hidden: int,
         both_levels_reward: bool,
         key: PRNGKey,
+        activation: Activation = "relu",
     ):
         """`agent` and `full` are the widths of what decoders see: its own level, and all levels."""
         keys = jax.random.split(key, 6)
 
         def decoders(seen: Widths, sizes: tuple[int, ...], keys: Array) -> tuple[Linear, list[MLP]]:
-            whole = [MLP(seen, n, hidden, n_hidden, k) for n, k in zip(sizes, keys, strict=True)]
+            whole = [
+                MLP(seen, n, hidden, n_hidden, k, activation=activation)
+                for n, k in zip(sizes, keys, strict=True)
+            ]
             first = jax.tree.map(
                 lambda *x: jnp.concatenate(x, axis=-1), *(mlp.layers[0] for mlp in whole)
             )
@@ -77,7 +81,8 @@ class Heads(eqx.Module):
         """Decode one agent's latents: its own level, and all levels."""
 
         def split(first: Linear, seen: Features, n: int) -> list[Float[Array, " D"]]:
-            return jnp.split(jax.nn.relu(first(*parts_of(seen))), n, axis=-1)
+            parts = jnp.split(first(*parts_of(seen)), n, axis=-1)
+            return [activate(part, self.obs.activation) for part in parts]
 
         obs, reward = split(self.agent_in, agent, 2)
         terminated, available, action, *both = split(

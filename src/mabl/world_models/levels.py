@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.nets.categorical import Code, CodeShape, draw, still, unflatten
 from mabl.nets.gru import GRU
-from mabl.nets.mlp import MLP, Features, Linear, Part, Widths
+from mabl.nets.mlp import MLP, Activation, Features, Linear, Part, Widths, activate
+from mabl.nets.normaliser import Normaliser
 from mabl.types import PRNGKey
 
 Tree = TypeVar("Tree")
@@ -32,19 +33,28 @@ class Level(NamedTuple):
 
 
 class Recurrent(eqx.Module):
-    """Recurrent model h_t = f(h_{t-1}, z_{t-1}, a_{t-1}): a GRU behind one ReLU layer."""
+    """Recurrent model h_t = f(h_{t-1}, z_{t-1}, a_{t-1}): a GRU behind one hidden layer."""
 
     inputs: Linear
     cell: GRU
+    activation: Activation = eqx.field(static=True)
 
-    def __init__(self, latent: CodeShape, action_dim: int, hidden: int, key: PRNGKey):
+    def __init__(
+        self,
+        latent: CodeShape,
+        action_dim: int,
+        hidden: int,
+        key: PRNGKey,
+        activation: Activation = "relu",
+    ):
+        self.activation = activation
         key_inputs, key_cell = jax.random.split(key)
         self.inputs = Linear((latent, action_dim), hidden, key_inputs)
         self.cell = GRU(hidden, hidden, key_cell)
 
     def __call__(self, level: Level, action: Float[Array, " A"]) -> Float[Array, " D"]:
         """One step; `action` is encoded, the agent's own or the joint one."""
-        x = jax.nn.relu(self.inputs(level.z, action))
+        x = activate(self.inputs(level.z, action), self.activation)
         return self.cell(x, level.h)
 
 
@@ -54,8 +64,16 @@ class Categoricals(eqx.Module):
     mlp: MLP
     n_classes: int = eqx.field(static=True)
 
-    def __init__(self, n_in: Widths, hidden: int, shape: CodeShape, key: PRNGKey):
-        self.mlp = MLP(n_in, shape.n_categoricals * shape.n_classes, hidden, 1, key)
+    def __init__(
+        self,
+        n_in: Widths,
+        hidden: int,
+        shape: CodeShape,
+        key: PRNGKey,
+        activation: Activation = "relu",
+    ):
+        n_out = shape.n_categoricals * shape.n_classes
+        self.mlp = MLP(n_in, n_out, hidden, 1, key, activation=activation)
         self.n_classes = shape.n_classes
 
     def __call__(self, *inputs: Part) -> Float[Array, "K C"]:
@@ -92,6 +110,16 @@ def arriving(before: Tree, after: Tree) -> Tree:
     return jax.tree.map(mix, before, after, is_leaf=lambda x: isinstance(x, Level))
 
 
+def standardised(x: Float[Array, "*b F"], scale: Normaliser | None) -> Float[Array, "*b F"]:
+    """Features with zero mean and unit variance, if there is a scale; it is not trained."""
+    return x if scale is None else jax.lax.stop_gradient(scale).normalise(x)
+
+
+def restored(x: Float[Array, "*b F"], scale: Normaliser | None) -> Float[Array, "*b F"]:
+    """The inverse of `standardised`."""
+    return x if scale is None else jax.lax.stop_gradient(scale).restore(x)
+
+
 class AgentFilter(eqx.Module):
     """What an agent runs to know where it is: from its own observations and actions alone.
 
@@ -102,16 +130,28 @@ class AgentFilter(eqx.Module):
     encoder: MLP
     recurrent: Recurrent
     posterior: Categoricals
+    scale: Normaliser | None
+    """Running mean and variance of observations, by which they are standardised."""
     obs_dim: int = eqx.field(static=True)
     latent: CodeShape = eqx.field(static=True)
     hidden: int = eqx.field(static=True)
 
-    def __init__(self, obs_dim: int, action_dim: int, hidden: int, latent: CodeShape, key: PRNGKey):
+    def __init__(
+        self,
+        obs_dim: int,
+        action_dim: int,
+        hidden: int,
+        latent: CodeShape,
+        key: PRNGKey,
+        standardise: bool = False,
+        activation: Activation = "relu",
+    ):
+        self.scale = Normaliser.fresh(obs_dim) if standardise else None
         key_encoder, key_recurrent, key_posterior = jax.random.split(key, 3)
         self.obs_dim, self.latent, self.hidden = obs_dim, latent, hidden
-        self.encoder = MLP(obs_dim, hidden, hidden, 2, key_encoder)
-        self.recurrent = Recurrent(latent, action_dim, hidden, key_recurrent)
-        self.posterior = Categoricals((hidden, hidden), hidden, latent, key_posterior)
+        self.encoder = MLP(obs_dim, hidden, hidden, 2, key_encoder, activation=activation)
+        self.recurrent = Recurrent(latent, action_dim, hidden, key_recurrent, activation)
+        self.posterior = Categoricals((hidden, hidden), hidden, latent, key_posterior, activation)
 
     def initial(self) -> Level:
         """The latent before an episode's first row: zeros."""
@@ -119,7 +159,7 @@ class AgentFilter(eqx.Module):
 
     def embed(self, obs: Float[Array, " O"]) -> Float[Array, " D"]:
         """Encode o_t^i; independent of the past, so that training does it outside the scan."""
-        return jax.nn.relu(self.encoder(obs))
+        return self.encoder.embed(standardised(obs, self.scale))
 
     def infer(
         self, level: Level, prev_action: Float[Array, " A"], embed: Float[Array, " D"], key: PRNGKey

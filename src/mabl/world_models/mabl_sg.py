@@ -7,12 +7,13 @@ from jaxtyping import Array, Float
 from mabl.envs.base import EnvSpec
 from mabl.nets.categorical import Code, draw, still
 from mabl.nets.mlp import Features
+from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.bilevel import BiLevel, Inputs, Latent
 from mabl.world_models.heads import Predictions
-from mabl.world_models.levels import AgentFilter, Level, forget, team_of
+from mabl.world_models.levels import AgentFilter, Level, forget, restored, team_of
 
 
 class MABLSG(eqx.Module):
@@ -33,6 +34,11 @@ class MABLSG(eqx.Module):
     def filter(self) -> AgentFilter:
         """The agent level's posterior: all of the model that execution needs."""
         return self.nets.filter
+
+    @property
+    def state_scale(self) -> Normaliser | None:
+        """Running mean and variance of the state."""
+        return self.nets.state_scale
 
     def initial(self) -> Latent:
         """The latents before an episode's first row: zeros."""
@@ -92,7 +98,9 @@ class MABLSG(eqx.Module):
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent from its own level and the team's."""
-        return jax.vmap(self.nets.heads)(self.actor_features(latent), self.critic_features(latent))
+        features = self.actor_features(latent), self.critic_features(latent)
+        predicted = jax.vmap(self.nets.heads)(*features)
+        return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
 
     def actor_features(self, latent: Latent) -> Features:
         """(z^a, h^a): all that a policy may see."""

@@ -18,12 +18,13 @@ from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.attention import TransformerEncoder
 from mabl.nets.categorical import CodeShape, draw, still
 from mabl.nets.gru import GRU
-from mabl.nets.mlp import MLP, Features, Linear
+from mabl.nets.mlp import MLP, Features, Linear, activate
+from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads, Predictions
-from mabl.world_models.levels import Categoricals, Level, forget, team_of
+from mabl.world_models.levels import Categoricals, Level, forget, restored, standardised, team_of
 
 
 @dataclass(frozen=True)
@@ -95,19 +96,21 @@ class FilterNets(eqx.Module):
     ):
         keys = jax.random.split(key, 5)
         hidden, latent = config.hidden, config.latent
-        self.encoder = MLP(spec.obs_dim, hidden, hidden, 2, keys[0])
+        activation = config.activation
+        self.encoder = MLP(spec.obs_dim, hidden, hidden, 2, keys[0], activation=activation)
         self.inputs = Linear((latent, spec.action_space.size), hidden, keys[1])
         self.communication = TransformerEncoder(
             hidden, communication.n_layers, communication.n_heads, communication.dropout, keys[2]
         )
         self.cell = GRU(hidden, hidden, keys[3])
-        self.posterior = Categoricals((hidden, hidden), hidden, latent, keys[4])
+        self.posterior = Categoricals((hidden, hidden), hidden, latent, keys[4], activation)
 
     def listen(
         self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey | None
     ) -> Float[Array, "N D"]:
         """What this agent's transformer makes of everybody's z and action."""
-        said = jax.nn.relu(jax.vmap(self.inputs)(latent.level.z, action))
+        said = jax.vmap(self.inputs)(latent.level.z, action)
+        said = activate(said, self.encoder.activation)
         return self.communication(said, latent.alive, key)
 
 
@@ -115,6 +118,8 @@ class JointFilter(eqx.Module):
     """What a team runs to know where it is; every agent's latent depends on everybody's."""
 
     team: Team
+    scale: Normaliser | None
+    """Running mean and variance of observations, by which they are standardised."""
     n_agents: int = eqx.field(static=True)
     obs_dim: int = eqx.field(static=True)
     latent: CodeShape = eqx.field(static=True)
@@ -130,6 +135,7 @@ class JointFilter(eqx.Module):
     ):
         self.n_agents, self.obs_dim = spec.n_agents, spec.obs_dim
         self.latent, self.hidden = config.latent, config.hidden
+        self.scale = Normaliser.fresh(spec.obs_dim) if config.standardise else None
         self.team = Team(
             lambda key: FilterNets(spec, config, communication, key), spec.n_agents, shared, key
         )
@@ -145,7 +151,8 @@ class JointFilter(eqx.Module):
 
     def embed(self, obs: Float[Array, "N O"]) -> Float[Array, "N D"]:
         """Encode every agent's observation; independent of the past."""
-        return self.team.map(lambda nets, obs: jax.nn.relu(nets.encoder(obs)), obs)
+        obs = standardised(obs, self.scale)
+        return self.team.map(lambda nets, obs: nets.encoder.embed(obs), obs)
 
     def recur(
         self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey | None = None
@@ -197,7 +204,7 @@ class DecoderNets(eqx.Module):
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
         key_prior, key_heads = jax.random.split(key)
         hidden, latent = config.hidden, config.latent
-        self.prior = Categoricals((hidden,), hidden, latent, key_prior)
+        self.prior = Categoricals((hidden,), hidden, latent, key_prior, config.activation)
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, hidden),
@@ -207,6 +214,7 @@ class DecoderNets(eqx.Module):
             n_hidden=config.n_hidden,
             both_levels_reward=False,
             key=key_heads,
+            activation=config.activation,
         )
 
 
@@ -276,9 +284,10 @@ class MAMBA(eqx.Module):
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent from its own latent."""
-        return self.decoders.map(
+        predicted = self.decoders.map(
             lambda nets, features: nets.heads(features, features), latent.level.features()
         )
+        return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
 
     def actor_features(self, latent: Latent) -> Features:
         """(z, h)."""
