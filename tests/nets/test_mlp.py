@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mabl.nets.categorical import Code, CodeShape, draw
-from mabl.nets.mlp import MLP, Linear, dense, parts_of, widths_of
+from mabl.nets.mlp import MLP, Linear, activate, dense, parts_of, widths_of
 
 
 def largest(layer: Linear) -> float:
@@ -181,3 +181,24 @@ def test_parts_as_one_vector_by_hand():
     assert_array_equal(dense((x, code)), [[0.5, 0, 1, 1, 0], [7, 0, 0, 0, 0]])
     assert_array_equal(dense(code), [[0, 1, 1, 0], [0, 0, 0, 0]])
     assert_array_equal(dense(x), x)
+
+
+def test_hidden_layers_may_be_normalised_by_their_root_mean_square_and_pass_through_silu():
+    # (3, -4, 0, 0): mean square 25 / 4, root 2.5; normalised (1.2, -1.6, 0, 0). SiLU of x is
+    # x / (1 + exp(-x)): 1.2 / 1.301194 = 0.922230, -1.6 / 5.953032 = -0.268771.
+    x = jnp.array([3.0, -4.0, 0.0, 0.0])
+    assert_allclose(activate(x, "rms_silu"), [0.922230, -0.268771, 0, 0], rtol=1e-4)
+    # The size of what comes in does not matter.
+    assert_allclose(activate(100 * x, "rms_silu"), activate(x, "rms_silu"), rtol=1e-4)
+    assert_allclose(activate(x, "relu"), [3, 0, 0, 0])
+    assert_allclose(activate(jnp.zeros(4), "rms_silu"), jnp.zeros(4))
+
+
+@pytest.mark.parametrize("activation", ["relu", "rms_silu"])
+def test_an_mlp_activates_its_hidden_layers_and_an_embedding_its_output_too(activation):
+    mlp = MLP(3, 4, 5, 2, jax.random.key(0), activation=activation)
+    x = jnp.array([0.3, -1.0, 2.0])
+    first, second, last = mlp.layers
+    expected = last(activate(second(activate(first(x), activation)), activation))
+    assert_allclose(mlp(x), expected, rtol=1e-6)
+    assert_allclose(mlp.embed(x), activate(expected, activation), rtol=1e-6)

@@ -95,3 +95,14 @@ def test_it_passes_through_jit_and_scan():
 def test_a_batch_without_weight_changes_nothing():
     for normaliser in (Normaliser.fresh(), after([1.0, 3.0])):
         assert_array_equal(normaliser.update(jnp.array([9.0]), jnp.zeros(1), 0.9), normaliser)
+
+
+def test_features_have_moments_of_their_own():
+    # Rows (1, 10), (3, 30) and, without weight, (99, 99): means 2 and 20, variances 1 and 100.
+    rows = jnp.array([[[1.0, 10.0], [3.0, 30.0], [99.0, 99.0]]])
+    weights = jnp.array([[1.0, 1.0, 0.0]])
+    normaliser = Normaliser.fresh(2).update(rows, weights, 0.9)
+    assert_allclose(normaliser.mean, [2, 20], rtol=1e-5)
+    assert_allclose(normaliser.variance, [1, 100], rtol=1e-5)
+    assert_allclose(normaliser.normalise(jnp.array([4.0, 0.0])), [2, -2], rtol=1e-4)
+    assert_allclose(normaliser.restore(jnp.array([[2.0, -2.0]])), [[4, 0]], atol=1e-3)

@@ -35,7 +35,9 @@ class Normaliser(NamedTuple):
         total = weights.sum() + 1e-8
         weights = weights.reshape(*weights.shape, *[1] * self.mean.ndim)
         mean = (weights * values).sum(batch) / total
-        variance = (weights * (values - mean) ** 2).sum(batch) / total
+        variance = (weights * (values - jnp.broadcast_to(mean, values.shape)) ** 2).sum(
+            batch
+        ) / total
         weight = decay * self.weight + (1 - decay)
         share = (1 - decay) / jnp.maximum(weight, 1e-8)  # of the batch in all that counts
         shift = mean - self.mean
@@ -53,10 +55,10 @@ class Normaliser(NamedTuple):
 
     def normalise(self, values: Float[Array, "*bf"]) -> Float[Array, "*bf"]:
         """Zero mean and unit variance, as far as is known."""
-        mean, std = self.moments()
+        mean, std = (jnp.broadcast_to(x, values.shape) for x in self.moments())
         return (values - mean) / std
 
     def restore(self, values: Float[Array, "*bf"]) -> Float[Array, "*bf"]:
         """The inverse of `normalise`."""
-        mean, std = self.moments()
+        mean, std = (jnp.broadcast_to(x, values.shape) for x in self.moments())
         return values * std + mean

@@ -369,9 +369,10 @@ def decoder_losses(
     """
     alive = rows.alive.astype(jnp.float32)
     acted = alive * ~rows.is_first[..., None]
+    std = jnp.broadcast_to(obs_std, rows.obs.shape)
     losses = {
         "obs": config.obs_weight
-        * (alive * optax.huber_loss(predicted.obs / obs_std, rows.obs / obs_std).sum(-1)),
+        * (alive * optax.huber_loss(predicted.obs / std, rows.obs / std).sum(-1)),
         "reward": config.reward_weight
         * reward_loss(predicted.reward, rows.reward, config.reward_loss),
         "terminated": config.end_weight
