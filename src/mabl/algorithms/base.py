@@ -46,6 +46,16 @@ class Algorithm(Protocol):
         """Joint steps that are imagined in a policy update, and learned from."""
         ...
 
+    @property
+    def policy_gradient_steps(self) -> int:
+        """Gradient steps of a policy update."""
+        ...
+
+    @property
+    def model_rows(self) -> int:
+        """Replayed joint rows that a model update trains on; 0 without a model."""
+        ...
+
     def init(self, key: PRNGKey) -> Any:
         """A fresh learner."""
         ...

@@ -63,6 +63,16 @@ class MAG(NamedTuple):
         """Those learned from; candidates and lookahead are not counted."""
         return self.base.imagined_steps
 
+    @property
+    def policy_gradient_steps(self) -> int:
+        """The behaviour's, from all imagined rows."""
+        return self.base.policy_gradient_steps
+
+    @property
+    def model_rows(self) -> int:
+        """Rows of a batch; those that the error predictor learns from are not counted."""
+        return self.base.model_rows
+
     def init(self, key: PRNGKey) -> LookaheadLearner:
         """Fresh parameters and optimisers."""
         config = self.config.lookahead

@@ -63,6 +63,16 @@ class ModelBased(NamedTuple):
         rows = sizes.batch_size * sizes.batch_length
         return min(rows, plan.n_starts or rows) * (plan.horizon - 1)
 
+    @property
+    def policy_gradient_steps(self) -> int:
+        """The behaviour's, from all imagined rows."""
+        return self.behaviour.gradient_steps(self.imagined_steps)
+
+    @property
+    def model_rows(self) -> int:
+        """Rows of a batch of sequences."""
+        return self.config.world_model.batch_size * self.config.world_model.batch_length
+
     def init(self, key: PRNGKey) -> Learner:
         """Fresh parameters and optimisers."""
         key_model, key_behaviour = jax.random.split(key)

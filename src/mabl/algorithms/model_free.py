@@ -13,7 +13,7 @@ from jaxtyping import Array
 from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
 from mabl.behaviour.actor import actor_for
-from mabl.behaviour.base import minibatch_of, minibatches
+from mabl.behaviour.base import minibatch_of, minibatch_steps, minibatches
 from mabl.behaviour.critic import Critic
 from mabl.behaviour.mappo import PPORows, real_returns, weighted_mean
 from mabl.behaviour.recurrent import (
@@ -21,6 +21,7 @@ from mabl.behaviour.recurrent import (
     RecurrentFilter,
     policies,
     recurrent_policy_loss,
+    recurrent_update_kl,
     value_loss,
 )
 from mabl.envs.base import EnvSpec
@@ -81,6 +82,18 @@ class ModelFree:
 
     @property
     def imagined_steps(self) -> int:
+        """None: there is no model."""
+        return 0
+
+    @property
+    def policy_gradient_steps(self) -> int:
+        """Minibatches of all epochs over the chunks of a cycle."""
+        plan, config = self.config.training, self.config.recurrent_mappo
+        n_chunks = plan.num_envs * ((plan.collect_steps or 0) // config.chunk_length)
+        return minibatch_steps(n_chunks, -(-n_chunks // config.n_minibatches), config.n_epochs)
+
+    @property
+    def model_rows(self) -> int:
         """None: there is no model."""
         return 0
 
@@ -156,7 +169,10 @@ class ModelFree:
             return learner, policy_metrics | critic_metrics
 
         learner, history = jax.lax.scan(minibatch, learner, batches)
-        return learner, metrics | jax.tree.map(jnp.mean, history)
+        first = minibatch_of(chunks, batches[0])
+        return learner, metrics | jax.tree.map(jnp.mean, history) | {
+            "behaviour/update_kl": recurrent_update_kl(learner.policy, first)
+        }
 
     def chunks(self, learner: PolicyLearner, experience: Experience) -> tuple[Chunks, Metrics]:
         """The newest rows with their memories, log-probabilities, returns and advantages.

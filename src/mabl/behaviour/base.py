@@ -55,6 +55,10 @@ class Behaviour(Protocol[S]):
         """What each agent is expected to earn from here, in the replay's units."""
         ...
 
+    def gradient_steps(self, n_rows: int) -> int:
+        """Gradient steps of an update from trajectories of `n_rows` joint rows."""
+        ...
+
     def update(
         self,
         state: S,
@@ -83,6 +87,11 @@ def minibatches(key: PRNGKey, n_rows: int, batch_size: int, n_epochs: int) -> In
         return rearrange(order, "(m b) -> m b", b=size)
 
     return rearrange(jax.vmap(shuffled)(jax.random.split(key, n_epochs)), "e m b -> (e m) b")
+
+
+def minibatch_steps(n_rows: int, batch_size: int, n_epochs: int) -> int:
+    """Number of the minibatches that `minibatches` makes."""
+    return n_epochs * (n_rows // min(batch_size, n_rows))
 
 
 def divided(key: PRNGKey, n_rows: int, n_parts: int, n_epochs: int) -> Int[Array, "M B"]:

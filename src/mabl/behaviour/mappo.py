@@ -13,7 +13,14 @@ from einops import rearrange
 from jaxtyping import Array, Float
 
 from mabl.behaviour.actor import Actor, Choice, ContinuousActor, actor_for, has_choice
-from mabl.behaviour.base import ActorFunction, annealed, divided, minibatch_of, minibatches
+from mabl.behaviour.base import (
+    ActorFunction,
+    annealed,
+    divided,
+    minibatch_of,
+    minibatch_steps,
+    minibatches,
+)
 from mabl.behaviour.critic import Critic
 from mabl.envs.base import ActionSpace
 from mabl.errors import UserError, require_between, require_positive
@@ -186,6 +193,10 @@ class MAPPO(NamedTuple):
         """The critic's."""
         return state.value(view.critic_features)
 
+    def gradient_steps(self, n_rows: int) -> int:
+        """Minibatches of all epochs."""
+        return minibatch_steps(n_rows, self.config.batch_size, self.config.n_epochs)
+
     def update(
         self,
         state: ActorCritic,
@@ -354,7 +365,7 @@ def update(
 
     The critic learns from `replayed` rows too, if there are any: each epoch divides them among its
     minibatches. `behaviour/update_kl` is KL(old || new) of the policy before and after the whole
-    update, estimated on one minibatch's actions [J. Schulman, "Approximating KL divergence"].
+    update, estimated on one minibatch's actions (`kl_of_choices`).
     """
     rows, metrics = experience(state.value, trajectory, config)
     returns = state.returns.update(rows.target, rows.weight, config.value_decay)
@@ -408,13 +419,21 @@ def update(
     return state, metrics | jax.tree.map(jnp.mean, history) | {
         "behaviour/ent_coef": state.ent_coef,
         "behaviour/update_kl": update_kl(state.actor, minibatch_of(rows, batches[0])),
-        "behaviour/gradient_steps": jnp.float32(batches.shape[0]),
     }
 
 
 def update_kl(actor: ActorFunction, rows: PPORows) -> Float[Array, ""]:
-    """KL(old || new) on `rows`, whose actions the old policy drew: E_old[r - 1 - log r]."""
+    """KL(old || new) on `rows`, whose actions the old policy drew."""
     policy = jax.vmap(jax.vmap(actor))(rows.view.actor_features, rows.view.available)
+    return kl_of_choices(policy, rows)
+
+
+def kl_of_choices(policy: Choice, rows: PPORows) -> Float[Array, ""]:
+    """Estimate of KL(old || new) from actions of the old policy: E_old[r - 1 - log r].
+
+    Rows of the dead, and rows without a choice, do not count [J. Schulman, "Approximating KL
+    divergence", 2020].
+    """
     weight = rows.weight * rows.view.alive * policy.free(rows.view.available)
     log_ratio = jnp.where(weight > 0, policy.log_prob(rows.action) - rows.log_prob, 0.0)
     return weighted_mean(jnp.expm1(log_ratio) - log_ratio, weight)

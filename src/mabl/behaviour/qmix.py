@@ -11,7 +11,7 @@ from einops import rearrange
 from jaxtyping import Array, Bool, Float, Int
 
 from mabl.behaviour.actor import MaskedCategorical
-from mabl.behaviour.base import minibatch_of, minibatches
+from mabl.behaviour.base import minibatch_of, minibatch_steps, minibatches
 from mabl.envs.base import ActionSpace
 from mabl.errors import require_between, require_positive
 from mabl.losses.returns import lambda_returns
@@ -182,6 +182,10 @@ class QMIX(NamedTuple):
         """Q_tot of the best joint action, for everybody."""
         total = state.values.chosen(view, state.values.best(view))
         return jnp.broadcast_to(total, view.alive.shape)
+
+    def gradient_steps(self, n_rows: int) -> int:
+        """Minibatches of all epochs."""
+        return minibatch_steps(n_rows, self.config.batch_size, self.config.n_epochs)
 
     def update(
         self,

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.behaviour.actor import Choice
 from mabl.behaviour.base import ActorFunction
-from mabl.behaviour.mappo import PPORows, policy_loss, weighted_mean
+from mabl.behaviour.mappo import PPORows, kl_of_choices, policy_loss, weighted_mean
 from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.gru import GRU
 from mabl.nets.mlp import Linear
@@ -163,11 +163,20 @@ def recurrent_policy_loss(
     policy: Any, chunks: Chunks, ent_coef: Float[Array, ""], clip: float
 ) -> tuple[Float[Array, ""], Metrics]:
     """PPO's loss of a recurrent policy (a filter and an actor), unrolled from stored memories."""
+    return policy_loss(unrolled(policy, chunks), chunks.rows, ent_coef, clip)
+
+
+def recurrent_update_kl(policy: Any, chunks: Chunks) -> Float[Array, ""]:
+    """KL(old || new) on chunks whose actions the old policy drew; see `mappo.update_kl`."""
+    return kl_of_choices(unrolled(policy, chunks), chunks.rows)
+
+
+def unrolled(policy: Any, chunks: Chunks) -> Choice:
+    """The policy at every row of chunks, from the memories stored where they begin."""
     unroll = jax.vmap(policy.filter.unroll, in_axes=(0, 1, None), out_axes=1)
     _, memory = jax.vmap(unroll)(chunks.memory, chunks.obs, chunks.is_first)
     view = chunks.rows.view._replace(actor_features=memory)
-    now = policies(policy.filter, policy.actor, view)
-    return policy_loss(now, chunks.rows, ent_coef, clip)
+    return policies(policy.filter, policy.actor, view)
 
 
 def value_loss(

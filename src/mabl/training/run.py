@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
+from mabl.algorithms.base import Algorithm
 from mabl.algorithms.config import Config
 from mabl.algorithms.diagnostics import DIAGNOSED_ROWS
 from mabl.devices import SEEDS
@@ -26,6 +27,7 @@ from mabl.training.loop import Training, TrainState
 from mabl.training.memory import check_memory, free_memory
 from mabl.training.programs import grid_of, programs
 from mabl.training.progress import Progress, duration
+from mabl.training.watching import Watch
 
 CURVES_EVERY = 30.0
 """Seconds between refreshes of curves.png."""
@@ -164,7 +166,7 @@ def _run(
         MetricsLog(path, resume_at=own if resumed else None)
         for path, own in zip(folders, own_steps, strict=True)
     ]
-    warned = False
+    warned, watch = False, Watch(total_steps)
     saved, drawn, began = step, time.monotonic(), time.monotonic()
     console.print("compiling (cached for the next run) ...", highlight=False)
     with (
@@ -194,12 +196,14 @@ def _run(
                 row = describe(
                     {name: float(v[k]) for name, v in metrics.items()}, training.env.spec
                 )
-                row["train/imagined_steps"] = n_policy * training.algorithm.imagined_steps
+                row |= learned_per_step(training.algorithm, n_model, n_policy, step - before)
                 row["time/seconds"] = seconds
                 row["time/steps_per_second"] = (step - before) / seconds
                 log.write(int(states.env_steps[k]), row)
                 if k == 0:
                     progress.update({"step": step, **row})
+                    for warning in watch.warnings(step, row):
+                        console.print(warning, highlight=False, soft_wrap=True)
             if crossed(saved, step, config.training.checkpoint_every):
                 saved = step
                 save(training, states, checkpoints, logs)
@@ -220,6 +224,17 @@ def _run(
         hint = f"mabl eval {path}" if finished else f"mabl resume {path}"
         console.print(f"next: {hint}", highlight=False, soft_wrap=True)
     return Outcome(folders, interruption.received, finished)
+
+
+def learned_per_step(algorithm: Algorithm, n_model: int, n_policy: int, steps: int) -> Row:
+    """How much a cycle of `steps` environment steps learns from."""
+    return {
+        "train/imagined_steps": n_policy * algorithm.imagined_steps,
+        "train/replayed_rows_per_env_step": n_model * algorithm.model_rows / steps,
+        "train/policy_gradient_steps_per_env_step": (
+            n_policy * algorithm.policy_gradient_steps / steps
+        ),
+    }
 
 
 def updates_due(states: TrainState, training: Training) -> tuple[int, int]:
