@@ -93,8 +93,9 @@ class Config:
     """Algorithm: `mabl algos` lists them."""
     label: str = ""
     """What run folders and reports call it; default: the algorithm's name."""
-    preset: Literal["quick", "paper"] = "quick"
-    """Hyperparameters to start from: `quick` (a 2-core CPU) or `paper` (Tables 2 to 4)."""
+    preset: Literal["quick", "efficient", "paper"] = "quick"
+    """Hyperparameters to start from: `quick` (a 2-core CPU), `efficient` (SMAX and SMAC, where
+    environment steps are dear: more learning for each) or `paper` (Tables 2 to 4)."""
     total_steps: int = 100_000
     """Environment steps of the run; one step is one joint step of the team."""
     seed: int = 0

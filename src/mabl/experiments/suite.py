@@ -69,7 +69,7 @@ class Suite:
     seeds: int = 3
     """How many."""
     first_seed: int = 0
-    preset: Literal["quick", "paper"] = "quick"
+    preset: Literal["quick", "efficient", "paper"] = "quick"
     config: dict = field(default_factory=dict)
     eval_episodes: int = 320
     """Of the trained policy, greedy: ten times the 32 of a point in evaluations of MARL."""
