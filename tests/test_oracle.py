@@ -1,0 +1,154 @@
+"""The oracle imagines what the simulator does, in the parts that it replaces and in no others."""
+
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from benchmarks import oracle as instrument
+from benchmarks import oracle_table
+from benchmarks.oracle import Oracle, Parts
+from numpy.testing import assert_allclose, assert_array_equal
+from tests.tiny import flags, tiny
+
+from mabl.training.programs import build
+
+SCALE = 10.0
+"""Of rewards, in the preset of the test environments."""
+
+
+def imagined(parts: Parts, algo: str = "mabl", **options):
+    """A trajectory `[H, B, N]` from replayed steps of the coordination task."""
+    config = tiny(algo)
+    config = replace(config, imagination=replace(config.imagination, n_starts=8, **options))
+    training = build(config)
+    oracle = Oracle(training.env, training.algorithm, parts)
+
+    @jax.jit
+    def run(key):
+        state = oracle.init(key)
+        for _ in range(3):
+            state, _ = oracle.cycle(state, 0, 0, 1000)
+        return oracle.imagine(state.learner, state.replay, jax.random.key(1))[0]
+
+    return jax.device_get(run(jax.random.key(0)))
+
+
+def truth(trajectory):
+    """Rewards and ends that the rules of the task give to the imagined actions."""
+    state = trajectory.view.critic_features[1][..., 0, :]
+    cue, t = state[..., :3].argmax(-1), np.rint(4 * state[..., 3])
+    wanted = (cue[:-1, :, None] + np.arange(2)) % 3
+    paid = SCALE * (trajectory.action == wanted).all(-1, keepdims=True)
+    return np.broadcast_to(paid, trajectory.action.shape), (t[1:] == 4)[..., None], t
+
+
+@pytest.mark.parametrize("algo", ["mabl", "dreamer-v2"])
+def test_what_is_imagined_follows_the_rules_of_the_task(algo):
+    trajectory = imagined(Parts("observations", "true", "true", "true"), algo)
+    paid, ended, t = truth(trajectory)
+    going_on = trajectory.weight > 0
+    assert going_on[0].all() and not going_on.all()
+    assert_array_equal(trajectory.reward[going_on], paid[going_on])
+    assert 0 < trajectory.reward[going_on].mean() < SCALE
+    assert_array_equal(
+        trajectory.continues[going_on], (~ended * np.ones(2, bool))[going_on].astype(float)
+    )
+    assert (np.diff(t, axis=0)[going_on[..., 0]] == 1).all()
+    # Nothing counts past an end.
+    after = np.concatenate([np.zeros_like(ended[:1]), ended[:-1]]).cumsum(0) > 0
+    assert_array_equal(trajectory.weight, 1.0 - (after * np.ones(2)))
+
+
+def test_policies_see_latents_or_observations():
+    seen = imagined(Parts("observations", "true", "true", "true")).view.actor_features
+    assert seen.shape[-1] == 6
+    z, h = imagined(Parts("latents", "true", "true", "true")).view.actor_features
+    assert h.shape[-1] == 16 and z.index.shape[-1] == 2
+
+
+@pytest.mark.parametrize("reward", ["true", "learned"])
+@pytest.mark.parametrize("ends", ["true", "learned"])
+@pytest.mark.parametrize("dynamics", ["true", "learned"])
+def test_each_part_is_the_simulators_or_the_models(dynamics, reward, ends):
+    trajectory = imagined(Parts("latents", dynamics, reward, ends))
+    rewards = np.unique(trajectory.reward[0])
+    assert (set(rewards) <= {0.0, SCALE}) == (reward == "true")
+    assert (set(np.unique(trajectory.continues)) <= {0.0, 1.0}) == (ends == "true")
+    # The fourth action is never available; a model that has learned nothing does not know.
+    available = trajectory.view.available[1:]
+    assert not available[..., 3].any() or dynamics == "learned"
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(trajectory))
+
+
+def test_qmix_learns_from_observations_and_the_state():
+    config = tiny("mabl-qmix")
+    training = build(config)
+    oracle = Oracle(training.env, training.algorithm, Parts("observations", "true", "true", "true"))
+
+    @jax.jit
+    def run(key):
+        state = oracle.init(key)
+        state, _ = oracle.cycle(state, 0, 0, 1000)
+        return state.learner.behaviour, oracle.cycle(state, 0, 1, 1000)
+
+    before, (after, metrics) = run(jax.random.key(0))
+    assert jnp.isfinite(metrics["behaviour/critic_loss"])
+    moved = jax.tree.map(
+        lambda a, b: jnp.any(a != b), before.values, after.learner.behaviour.values
+    )
+    assert all(jax.tree.leaves(moved))
+
+
+def test_it_tells_its_points_and_the_table_reads_them(tmp_path, capsys):
+    file = tmp_path / "points.jsonl"
+    for seed in (0, 1):
+        instrument.run(
+            [
+                *flags("mabl", "test/coordination"),
+                *("--total-steps=400", "--every=200", "--evaluate-every=400", f"--seed={seed}"),
+                *("--name=tiny", f"--json={file}"),
+            ]
+        )
+    points = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [point["seed"] for point in points] == sorted(point["seed"] for point in points)
+    assert points[-1]["step"] >= 400 and 0 <= points[-1]["greedy"] <= 1
+    assert 0 < points[-1]["entropy_share"] <= 1
+    assert "loss" not in points[-1]  # there is no model
+    table = oracle_table.table(oracle_table.read([file]), [400])
+    ends = [point["greedy"] for point in points if "greedy" in point][-2:]
+    assert f"| test/coordination | tiny | 0, 1 | {np.mean(ends):.2f} (" in table
+    oracle_table.draw(oracle_table.read([file]), tmp_path / "points.png")
+    assert (tmp_path / "points.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--algo=mappo", "--env=test/coordination"], "needs a compiled environment"),
+        (["--env=test/host-counting"], "needs a compiled environment"),
+        (["--env=test/coordination", "--reward=learned"], "give --inputs latents"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, message, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["oracle", *arguments])
+    with pytest.raises(SystemExit) as exit_:
+        instrument.main()
+    assert exit_.value.code == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
+
+
+def test_scores_of_an_evaluation_are_means_over_seeds():
+    points = {
+        ("e", "s"): {
+            seed: [{"step": 20_010, "greedy": greedy, "sampled": 0.5, "cpu_seconds": 60.0}]
+            for seed, greedy in ((0, 0.25), (1, 0.75))
+        }
+    }
+    assert oracle_table.table(points, [20_000]).splitlines()[-1] == (
+        "| e | s | 0, 1 | 0.50 (0.25 to 0.75) | 0.50 (0.50 to 0.50) | 1.0 |"
+    )
+    assert_allclose(oracle_table.score_of({"episode_return": 3.0}), 3.0)
