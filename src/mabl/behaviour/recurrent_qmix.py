@@ -143,11 +143,6 @@ class QNetworks(NamedTuple):
         memory = unroll(self.filter.initial(), actions, rows.obs, rows.is_first)
         return TeamView(self.filter.features(memory), rows.state, rows.available, rows.alive)
 
-    def chosen(self, rows: TimeStep) -> Float[Array, "T-1"]:
-        """Q_tot of the joint actions taken at all rows of one sequence but the last."""
-        view = jax.tree.map(lambda x: x[:-1], self.view(rows))
-        return jax.vmap(self.values.chosen)(view, rows.prev_action[1:])
-
     def greedy(self, rows: TimeStep) -> Float[Array, " T"]:
         """Q_tot of the best available joint action at each row of one sequence."""
         view = self.view(rows)
