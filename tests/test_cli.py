@@ -103,6 +103,14 @@ MISTAKES = {
         ["train", "--algo=mabl-qmix", "--qmix.epsilon-start=0.1", "--qmix.epsilon-end=0.2"],
         "--qmix.epsilon-end is 0.2: give a number from 0 to 0.1",
     ),
+    "burn-in": (
+        ["train", "--algo=qmix", "--recurrent-qmix.burn-in=29"],
+        "--recurrent-qmix.burn-in is 29: give a number from 0 to 2 less than the 30 rows",
+    ),
+    "no model to update": (
+        ["train", "--algo=qmix", "--training.model-updates=5"],
+        "--training.model-updates is 5: qmix has no model: give 0",
+    ),
     "off-policy": (
         ["train", "--algo=mappo", "--training.policy-updates=3"],
         "--training.policy-updates is 3: mappo learns once from what it has just done",
@@ -158,6 +166,7 @@ def test_a_misspelt_flag_is_explained(mabl):
         ("mabl-qmix", "--mappo.hidden"),
         ("mappo", "--world-model.hidden"),
         ("mappo", "--imagination.horizon"),
+        ("qmix", "--qmix.hidden"),
     ],
 )
 def test_what_an_algorithm_does_not_read_has_no_flags(mabl, algo, flag):

@@ -34,6 +34,15 @@ SIZES = {
     "mappo": {"hidden": 16, "n_hidden": 1, "n_heads": 2, "n_epochs": 2},
     "qmix": {"hidden": 16, "n_hidden": 1, "mixer_hidden": 4, "hypernet_hidden": 4, "n_epochs": 2},
     "recurrent_mappo": {"hidden": 16, "n_heads": 2, "n_epochs": 2, "chunk_length": 10},
+    "recurrent_qmix": {
+        "hidden": 16,
+        "mixer_hidden": 4,
+        "hypernet_hidden": 4,
+        "batch_size": 4,
+        "batch_length": 8,
+        "burn_in": 2,
+        "epsilon_end": 0.5,
+    },
 }
 LEARNING_STARTS = {"prefill_steps": 100, "pretrain_updates": 3}
 
@@ -45,7 +54,7 @@ def tiny(algo: str, env: str = "test/coordination") -> Config:
     if "world_model" in sections:
         sections["training"] = sections["training"] | LEARNING_STARTS
     else:
-        sections["training"] = sections["training"] | {"model_updates": 0}
+        sections["training"] = sections["training"] | {"model_updates": 0, "prefill_steps": 0}
     return replace(
         config, **{name: replace(getattr(config, name), **new) for name, new in sections.items()}
     )

@@ -19,6 +19,7 @@ from mabl.training.programs import build, forget_programs, programs
 ENV = "test/counting"
 """Its episodes end and are cut short, actions are unavailable, and an agent dies."""
 STEPS, MORE_STEPS = 400, 500
+"""Between checkpoints, and of a run: more than one interval, less than two."""
 
 EVERY = pytest.mark.parametrize(
     # Tests of one algorithm share its compiled program, so they belong to one worker.
@@ -34,33 +35,50 @@ def logdir(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(logdir):
-    """`run(algo)` is the folder of a short run."""
-    return cache(lambda algo: train_to(STEPS, algo, logdir / "short"))
+    """`run(algo)` is the folder of a run with two checkpoints."""
+
+    def train(algo: str) -> Path:
+        given = [*flags(algo, ENV), f"--total-steps={MORE_STEPS}", f"--logdir={logdir / 'whole'}"]
+        assert cli.run(["train", *given, f"--training.checkpoint-every={STEPS}"]) == 0
+        (folder,) = (logdir / "whole").glob(f"{ENV}/{algo}/seed_0/*")
+        return folder
+
+    return cache(train)
 
 
 @pytest.fixture(scope="module")
-def resumed(run, logdir):
-    """`resumed(algo)` is a copy of it with damaged metrics, resumed in a process like new."""
+def killed(run, logdir):
+    """`killed(algo)` is a copy of it without its last checkpoint and with damaged metrics."""
+
+    @cache
+    def kill(algo: str) -> Path:
+        folder = logdir / "killed" / algo
+        shutil.copytree(run(algo), folder)
+        checkpoints = Checkpoints(folder / "checkpoints")
+        last, first = checkpoints.steps
+        assert first < MORE_STEPS <= last
+        shutil.rmtree(checkpoints.at(last))
+        with (folder / "metrics.jsonl").open("a") as file:
+            file.write('{"step": 9999, "train/score": 1.0}\n{"step": 10')  # past it; torn
+        return folder
+
+    return kill
+
+
+@pytest.fixture(scope="module")
+def resumed(killed, logdir):
+    """`resumed(algo)` is a copy of that, resumed in a process like new."""
 
     @cache
     def resume(algo: str) -> Path:
         folder = logdir / "resumed" / algo
-        shutil.copytree(run(algo), folder)
-        with (folder / "metrics.jsonl").open("a") as file:
-            file.write('{"step": 9999, "train/score": 1.0}\n{"step": 10')  # past it; torn
+        shutil.copytree(killed(algo), folder)
         if algo == "mabl":  # as in a new process; for one, as tracing takes its time
             forget_programs()
-        assert cli.run(["resume", str(folder), f"--total-steps={MORE_STEPS}"]) == 0
+        assert cli.run(["resume", str(folder)]) == 0
         return folder
 
     return resume
-
-
-def train_to(steps: int, algo: str, logdir: Path) -> Path:
-    given = [*flags(algo, ENV), f"--total-steps={steps}", f"--logdir={logdir}"]
-    assert cli.run(["train", *given]) == 0
-    (folder,) = logdir.glob(f"{ENV}/{algo}/seed_0/*")
-    return folder
 
 
 def metrics_of(folder: Path) -> list[dict]:
@@ -77,8 +95,8 @@ def learner_of(folder: Path) -> dict[str, np.ndarray]:
 
 
 @EVERY
-def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(algo, resumed, logdir):
-    whole = train_to(MORE_STEPS, algo, logdir / "whole")
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(algo, resumed, run):
+    whole = run(algo)
     assert metrics_of(resumed(algo)) == metrics_of(whole)
     assert metrics_of(whole)[-1]["step"] >= MORE_STEPS
     one, other = learner_of(resumed(algo)), learner_of(whole)
@@ -87,11 +105,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(algo, resumed, lo
 
 
 @EVERY
-def test_learning_moves_every_parameter_and_keeps_them_finite(algo, run, resumed):
-    learned = metrics_of(run(algo))[-1]
-    assert learned["step"] >= STEPS and any(name.startswith("behaviour/") for name in learned)
+def test_learning_moves_every_parameter_and_keeps_them_finite(algo, killed, resumed):
+    learned = metrics_of(resumed(algo))[-1]
+    assert any(name.startswith("behaviour/") for name in learned)
     assert all(value is not None and np.isfinite(value) for value in learned.values())
-    before, after = learner_of(run(algo)), learner_of(resumed(algo))
+    before, after = learner_of(killed(algo)), learner_of(resumed(algo))
     assert all(np.isfinite(value).all() for value in after.values())
     still = [n for n in before if before[n].size > 1 and np.array_equal(before[n], after[n])]
     assert not still

@@ -12,6 +12,7 @@ from tests.tiny import tiny
 
 from mabl.algorithms import model_free
 from mabl.algorithms.base import Algorithm
+from mabl.algorithms.recurrent_qmix import RecurrentQMIX
 from mabl.algorithms.registry import ALGORITHMS, COLUMNS
 from mabl.envs.base import Discrete, EnvSpec
 from mabl.execution import executor_of
@@ -88,10 +89,13 @@ def play(algo: str, rows: TimeStep) -> tuple[jax.Array, jax.Array]:
 
 
 def learned_from(algo: str, rows: TimeStep) -> jax.Array:
-    """What training makes of each agent's rows `[STEPS, N, G]`: the input of its critic."""
+    """What training makes of each agent's rows `[STEPS, N, G]`: its critic's input, or Q_tot."""
     algorithm, learner = build(algo)
     if isinstance(algorithm, model_free.ModelFree):
         return model_free.critic_features(rows)
+    if isinstance(algorithm, RecurrentQMIX):  # what all its agents' losses share
+        total = learner.online.greedy(rows)
+        return jnp.broadcast_to(total[:, None, None], (STEPS, AGENTS, 1))
     model = getattr(learner, "base", learner).model
     latents, _ = observe_sequence(model, rows, jax.random.key(2))
     return dense(jax.vmap(model.critic_features)(latents))
@@ -121,7 +125,7 @@ def learns_from_state(algo: str) -> bool:
 def shares_parameters(algo: str) -> bool:
     algorithm, learner = build(algo)
     model = getattr(getattr(learner, "base", learner), "model", algorithm.policy(learner))
-    own = {leaf.shape[0] == AGENTS for leaf in jax.tree.leaves(model)}
+    own = {leaf.shape[0] == AGENTS for leaf in jax.tree.leaves(model) if leaf.ndim}
     assert len(own) == 1, "some parameters are shared, some are not"
     return not own.pop()
 

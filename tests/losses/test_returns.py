@@ -1,7 +1,8 @@
 import jax.numpy as jnp
+import pytest
 from numpy.testing import assert_allclose
 
-from mabl.losses.returns import lambda_returns
+from mabl.losses.returns import lambda_returns, returns_across_resets
 
 REWARD = jnp.array([1.0, 2.0, 3.0])
 NEXT_VALUE = jnp.array([10.0, 20.0, 30.0])
@@ -37,3 +38,17 @@ def test_trailing_axes_are_independent():
     assert returns.shape == (3, 1, 2)
     assert_allclose(returns[:, 0, 0], [6.4, 2.0, 30.0], rtol=1e-6)
     assert_allclose(returns[:, 0, 1], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("terminated", "returns"),
+    # Row 2 is a reset, discount 0.5. G_2 = 3 + 0.5 * 40 = 23; G_1 hands back V_1 = 8.
+    # Truncated at row 1: G_0 = 1 + 0.5 (0.5 * 8 + 0.5 * 8) = 5; terminated there: 1
+    [(False, [5, 8, 23]), (True, [1, 8, 23])],
+)
+def test_returns_do_not_pass_a_reset(terminated, returns):
+    value = jnp.array([100.0, 8.0, 200.0, 40.0])
+    rewards = jnp.array([1.0, 7.0, 3.0])
+    terminal = jnp.array([terminated, False, False])
+    reset = jnp.array([False, True, False])
+    assert_allclose(returns_across_resets(value, rewards, terminal, reset, 0.5, 0.5), returns)

@@ -34,7 +34,7 @@ def learned(config, compile_well, seed=0, programs=None):
     scores, counts = [], []
     while int(state.env_steps) < config.total_steps:
         due = updates_due(jax.tree.map(lambda x: x[None], state), training)
-        state, metrics = cycle(state, *due)
+        state, metrics = cycle(state, *due, config.total_steps)
         scores.append(float(metrics["episodes/score"]))
         counts.append(int(metrics["episodes/count"]))
     return training, state.learner, scores, counts

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, TypeVar
 from mabl.behaviour.mappo import MAPPOConfig
 from mabl.behaviour.qmix import QMIXConfig
 from mabl.behaviour.recurrent import RecurrentMAPPOConfig
+from mabl.behaviour.recurrent_qmix import RecurrentQMIXConfig
 from mabl.errors import UserError, require_between, require_positive, unknown_name
 from mabl.imagination import ImaginationConfig
 from mabl.nets.product import Precision
@@ -122,6 +123,7 @@ class Config:
     mappo: MAPPOConfig = field(default_factory=MAPPOConfig)
     qmix: QMIXConfig = field(default_factory=QMIXConfig)
     recurrent_mappo: RecurrentMAPPOConfig = field(default_factory=RecurrentMAPPOConfig)
+    recurrent_qmix: RecurrentQMIXConfig = field(default_factory=RecurrentQMIXConfig)
 
     @property
     def name(self) -> str:

@@ -62,16 +62,15 @@ class ModelFree:
                 f"--training.collect-steps is {rows}: give a multiple of the {length} rows of "
                 "--recurrent-mappo.chunk-length"
             )
-        plan = self.config.training
-        for field in ("model_updates", "pretrain_updates", "prefill_steps"):
-            if getattr(plan, field):
-                raise UserError(
-                    f"--training.{field.replace('_', '-')} is {getattr(plan, field)}: "
-                    f"{self.config.algo} has no model and learns from all it does: give 0"
-                )
-        if plan.policy_updates != 1:
+        require_none(
+            self.config,
+            *("model_updates", "pretrain_updates", "prefill_steps"),
+            reason="has no model and learns from all it does",
+        )
+        updates = self.config.training.policy_updates
+        if updates != 1:
             raise UserError(
-                f"--training.policy-updates is {plan.policy_updates}: {self.config.algo} learns "
+                f"--training.policy-updates is {updates}: {self.config.algo} learns "
                 "once from what it has just done: give 1, and --recurrent-mappo.n-epochs"
             )
 
@@ -236,6 +235,16 @@ class ModelFree:
                 optax.adam(config.learning_rate, eps=1e-5),
             )
         )
+
+
+def require_none(config: Config, *names: str, reason: str) -> None:
+    """Raise UserError where a field of the training schedule is not 0, as it would do nothing."""
+    for name in names:
+        if getattr(config.training, name):
+            raise UserError(
+                f"--training.{name.replace('_', '-')} is {getattr(config.training, name)}: "
+                f"{config.algo} {reason}: give 0"
+            )
 
 
 def critic_features(rows: TimeStep) -> Array:

@@ -255,6 +255,9 @@ _ON_POLICY = {"model_updates": 0, "policy_updates": 1, "prefill_steps": 0, "pret
 # The recipe's rollouts.
 _RECIPE = _ON_POLICY | {"num_envs": 8, "collect_steps": 400, "replay_capacity": 3_200}
 
+# Four updates an episode, as in "Higher Replay Ratio Empowers Sample-Efficient Multi-Agent RL".
+_OFF_POLICY = {"model_updates": 0, "pretrain_updates": 0}
+
 BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
     ("paper", "smax", "mamba"): _MAMBA_PAPER,
     ("paper", "smax", "mag"): _MAMBA_PAPER,
@@ -262,6 +265,8 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
     ("paper", "test", "mag"): _MAMBA_PAPER,
     ("paper", "smax", "mappo"): {"training": _RECIPE},
     ("paper", "test", "mappo"): {"training": _RECIPE},
+    ("paper", "smax", "qmix"): {"training": _OFF_POLICY},
+    ("paper", "test", "qmix"): {"training": _OFF_POLICY},
     ("quick", "smax", "mag"): {"lookahead": {"steps": 3, "hidden": 128, "n_hidden": 2}},
     ("quick", "smax", "mappo"): {
         "precision": "float32",
@@ -282,12 +287,31 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
             "epsilon_share": 0.17,
         },
     },
+    ("quick", "smax", "qmix"): {
+        "precision": "float32",
+        "training": _OFF_POLICY | {"num_envs": 16, "policy_updates": 16, "prefill_steps": 1_000},
+        "recurrent_qmix": {
+            "learning_rate": 1e-3,
+            "batch_length": 30,
+            "burn_in": 5,
+            "epsilon_share": 0.2,
+        },
+    },
     ("quick", "test", "mamba"): _MAMBA_TEST | {"mappo": {"ent_coef": 0.5}},
     ("quick", "test", "mag"): _MAMBA_TEST
     | {"lookahead": {"candidates": 2, "steps": 2, "hidden": 64, "n_hidden": 2}},
     ("quick", "test", "mappo"): {
         "training": _ON_POLICY | {"num_envs": 16, "collect_steps": 40, "replay_capacity": 640},
         "recurrent_mappo": {"learning_rate": 2e-3, "n_epochs": 10},
+    },
+    ("quick", "test", "qmix"): {
+        "training": _OFF_POLICY | {"policy_updates": 8, "prefill_steps": 500},
+        "recurrent_qmix": {
+            "learning_rate": 2e-3,
+            "batch_length": 10,
+            "burn_in": 2,
+            "epsilon_share": 0.6,
+        },
     },
     ("quick", "test", "mabl-qmix"): {
         "qmix": {

@@ -10,6 +10,7 @@ from mabl.algorithms.config import Config
 from mabl.algorithms.mag import MAG
 from mabl.algorithms.model_based import ModelBased
 from mabl.algorithms.model_free import ModelFree
+from mabl.algorithms.recurrent_qmix import RecurrentQMIX
 from mabl.behaviour.mappo import MAPPO
 from mabl.behaviour.qmix import QMIX
 from mabl.envs.base import Discrete, EnvSpec
@@ -106,6 +107,12 @@ ALGORITHMS = {
         ModelFree,
         "no world model: recurrent MAPPO on real episodes",
         sections=("training", "recurrent_mappo"),
+    ),
+    "qmix": Entry(
+        RecurrentQMIX,
+        "no world model: recurrent QMIX on replayed real episodes",
+        sections=("training", "recurrent_qmix"),
+        discrete=True,
     ),
 }
 

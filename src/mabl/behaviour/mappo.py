@@ -25,7 +25,7 @@ from mabl.behaviour.critic import Critic
 from mabl.envs.base import ActionSpace
 from mabl.errors import UserError, require_between, require_positive
 from mabl.losses.ppo import clipped_surrogate
-from mabl.losses.returns import lambda_returns
+from mabl.losses.returns import lambda_returns, returns_across_resets
 from mabl.nets.mlp import Features, widths_of
 from mabl.nets.normaliser import Normaliser
 from mabl.nets.optimiser import guarded
@@ -298,14 +298,16 @@ def real_returns(
     From an episode's last row to the next reset nothing passes: that step weighs nothing and hands
     back the last row's value, so that truncated episodes bootstrap.
     """
-    ends = rows.is_first[1:, None]
-    target = lambda_returns(
-        jnp.where(ends, value[:-1], shared_reward(rows.reward[1:], team_reward)),
-        gamma * (1.0 - (rows.terminated[1:] | ends)),
-        value[1:],
+    ends = jnp.broadcast_to(rows.is_first[1:, None], value[1:].shape)
+    target = returns_across_resets(
+        value,
+        shared_reward(rows.reward[1:], team_reward),
+        rows.terminated[1:],
+        ends,
+        gamma,
         gae_lambda,
     )
-    return target, jnp.broadcast_to(1.0 - ends, target.shape)
+    return target, 1.0 - ends
 
 
 def weighted_mean(values: Float[Array, "*b"], weight: Float[Array, "*b"]) -> Float[Array, ""]:

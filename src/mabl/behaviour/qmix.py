@@ -1,7 +1,7 @@
 """QMIX on latents [31]: the paper's value-based way to learn in imagination (section 3.3)."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -18,6 +18,8 @@ from mabl.losses.returns import lambda_returns
 from mabl.nets.mlp import MLP, Features, Part, Width, parts_of, widths_of
 from mabl.nets.optimiser import guarded
 from mabl.types import Metrics, PRNGKey, Progress, Replayed, TeamView, Trajectory
+
+Networks = TypeVar("Networks")
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ class QState(NamedTuple):
 
 
 class QRows(NamedTuple):
-    """Joint rows of imagined experience `[M, ...]`; targets and weights are the team's."""
+    """Joint rows of experience `[M, ...]`; targets and weights are the team's."""
 
     view: TeamView
     action: Array
@@ -165,7 +167,7 @@ class QMIX(NamedTuple):
             ),
         )
         target = jax.tree.map(jnp.copy, values)
-        opt = optimiser(config).init(eqx.filter(values, eqx.is_array))
+        opt = self._optimiser().init(eqx.filter(values, eqx.is_array))
         return QState(values, target, opt, jnp.float32(config.epsilon_start))
 
     def actor(self, state: QState) -> EpsilonGreedy:
@@ -204,30 +206,37 @@ class QMIX(NamedTuple):
         def minibatch(state: QState, index: Array) -> tuple[QState, Metrics]:
             batch = minibatch_of(rows, index)
             gradient, metrics = eqx.filter_grad(td_loss, has_aux=True)(state.values, batch)
-            step, opt = optimiser(config).update(gradient, state.opt)
+            step, opt = self._optimiser().update(gradient, state.opt)
             values = eqx.apply_updates(state.values, step)
-            target = jax.tree.map(
-                lambda new, old: old + config.target_rate * (new - old), values, state.target
-            )
+            target = moved(state.target, values, config.target_rate)
             return QState(values, target, opt, state.epsilon), metrics
 
         state, history = jax.lax.scan(minibatch, state, batches)
-        epsilon = annealed_epsilon(config, progress)
+        epsilon = annealed_epsilon(
+            config.epsilon_start, config.epsilon_end, config.epsilon_share, progress
+        )
         metrics |= jax.tree.map(jnp.mean, history) | {"behaviour/epsilon": epsilon}
         return state._replace(epsilon=epsilon), metrics
 
-
-def annealed_epsilon(config: QMIXConfig, progress: Progress) -> Float[Array, ""]:
-    """Probability of a random action: it falls linearly over the first `epsilon_share`."""
-    done = jnp.clip(progress / config.epsilon_share, 0, 1)
-    return config.epsilon_start + (config.epsilon_end - config.epsilon_start) * done
+    def _optimiser(self) -> optax.GradientTransformation:
+        return optimiser(self.config.learning_rate, self.config.grad_clip)
 
 
-def optimiser(config: QMIXConfig) -> optax.GradientTransformation:
+def annealed_epsilon(
+    start: float, end: float, share: float, progress: Progress
+) -> Float[Array, ""]:
+    """Probability of a random action: it falls linearly over the first `share` of the run."""
+    return start + (end - start) * jnp.clip(jnp.float32(progress) / share, 0, 1)
+
+
+def optimiser(learning_rate: float, grad_clip: float) -> optax.GradientTransformation:
     """Adam behind gradient clipping."""
-    return guarded(
-        optax.chain(optax.clip_by_global_norm(config.grad_clip), optax.adam(config.learning_rate))
-    )
+    return guarded(optax.chain(optax.clip_by_global_norm(grad_clip), optax.adam(learning_rate)))
+
+
+def moved(target: Networks, learned: Networks, rate: float) -> Networks:
+    """Target networks after a soft update: `rate` of the way to the learned ones."""
+    return jax.tree.map(lambda old, new: old + rate * (new - old), target, learned)
 
 
 def experience(state: QState, trajectory: Trajectory, config: QMIXConfig) -> tuple[QRows, Metrics]:
@@ -260,6 +269,9 @@ def experience(state: QState, trajectory: Trajectory, config: QMIXConfig) -> tup
 
 def td_loss(values: Values, rows: QRows) -> tuple[Float[Array, ""], Metrics]:
     """Half the squared error of Q_tot to its targets."""
-    error = jax.vmap(values.chosen)(rows.view, rows.action) - rows.target
-    loss = 0.5 * (rows.weight * error**2).sum() / (rows.weight.sum() + 1e-8)
-    return loss, {"behaviour/critic_loss": loss}
+    value, total = jax.vmap(values.chosen)(rows.view, rows.action), rows.weight.sum() + 1e-8
+    loss = 0.5 * (rows.weight * (value - rows.target) ** 2).sum() / total
+    return loss, {
+        "behaviour/critic_loss": loss,
+        "behaviour/value": (rows.weight * value).sum() / total,
+    }

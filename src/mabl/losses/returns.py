@@ -1,7 +1,8 @@
 """Lambda-returns along imagined or real trajectories (section 3.3)."""
 
 import jax
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 
 def lambda_returns(
@@ -25,3 +26,25 @@ def lambda_returns(
         backward, next_value[-1], (reward, discount, next_value), reverse=True
     )
     return returns
+
+
+def returns_across_resets(
+    value: Float[Array, "T *b"],
+    reward: Float[Array, "T-1 *b"],
+    terminated: Bool[Array, "T-1 *b"],
+    is_first: Bool[Array, "T-1 *b"],
+    gamma: float,
+    gae_lambda: float,
+) -> Float[Array, "T-1 *b"]:
+    """`lambda_returns` of a sequence of real rows, which may hold several episodes.
+
+    `value` belongs to all rows, the other arguments to the rows that transitions lead to. The
+    transition from an episode's last row to a reset hands back the last row's value: truncated
+    episodes bootstrap from it, terminated ones have a discount of 0 before it.
+    """
+    return lambda_returns(
+        jnp.where(is_first, value[:-1], reward),
+        gamma * (1.0 - (terminated | is_first)),
+        value[1:],
+        gae_lambda,
+    )
