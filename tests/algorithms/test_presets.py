@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 
 from mabl.algorithms.presets import BY_ALGORITHM, BY_ENV, preset
-from mabl.algorithms.registry import ALGORITHMS
+from mabl.algorithms.registry import ALGORITHMS, make
 from mabl.envs import registry as envs
+from mabl.envs.base import Discrete, EnvSpec
 from mabl.errors import UserError
 
 
@@ -16,8 +17,9 @@ from mabl.errors import UserError
         ("paper", "smax/3m", "mabl", 3e-4, 1.0),
         ("paper", "smax/3s_vs_5z", "mabl", 5e-4, 1.0),  # table 4
         ("paper", "smax/3s_vs_5z", "mamba", 2e-4, 1.0),  # its own on every map
-        ("quick", "smax/3m", "mabl", 1e-3, 20.0),
-        ("quick", "smax/3m", "mamba", 1e-3, 20.0),
+        ("quick", "smax/3m", "mabl", 1e-3, 1.0),
+        ("quick", "smax/3m", "mamba", 1e-3, 1.0),
+        ("efficient", "smax/3m", "mabl", 1e-3, 20.0),
         ("quick", "smax/2s3z", "mabl", 1e-3, 20.0),
         ("quick", "smax/2s3z", "mamba", 1e-3, 20.0),
     ],
@@ -30,23 +32,34 @@ def test_maps_and_algorithms_have_their_own(name, env, algo, learning_rate, rewa
 def test_maps_with_settings_of_their_own_exist():
     known = {row.name for row in envs.names()}
     assert {env for _, env in BY_ENV} <= known
-    assert {where for _, where, _ in BY_ALGORITHM if "/" in where} <= known
+    assert {family for _, family, _ in BY_ALGORITHM} <= {name.split("/")[0] for name in known}
 
 
-def test_one_setting_serves_all_maps_of_smax():
+def test_one_setting_of_efficient_serves_all_maps_of_smax():
     maps = [row.name for row in envs.names() if row.name.startswith("smax/")]
     for algo in ALGORITHMS:
-        settings = {replace(preset("quick", name, algo), env="") for name in maps}
+        settings = {replace(preset("efficient", name, algo), env="") for name in maps}
         assert len(settings) == 1, algo
 
 
-@pytest.mark.parametrize("algo", ["mabl", "mamba", "mappo", "mabl-qmix"])
-def test_efficient_is_quick_with_more_learning_for_each_step(algo):
-    quick, efficient = (preset(name, "smax/2s3z", algo) for name in ("quick", "efficient"))
-    same = {name: getattr(quick, name) for name in ("preset", "total_steps", "training")}
-    assert replace(efficient, **same) == quick
-    more = {"model_updates": 80, "policy_updates": 32} if algo not in ("mappo",) else {}
-    assert efficient.training == replace(quick.training, **more)
+def test_efficient_does_more_learning_for_each_step_in_world_models_alone():
+    def learned(name, algo):
+        config = preset(name, "smax/2s3z", algo)
+        spec = EnvSpec("stub", 5, 4, 5, Discrete(3), 10, "win_rate")
+        algorithm, plan = make(config, spec), config.training
+        steps = plan.num_envs * plan.collect_steps
+        return (
+            plan.model_updates * algorithm.model_rows / steps,
+            plan.policy_updates * algorithm.policy_gradient_steps / steps,
+        )
+
+    # 18 updates of 320 rows for 256 rows collected; 8 policy updates of 5 epochs of 1,600 rows in
+    # minibatches of 400
+    assert learned("quick", "mabl") == (22.5, 160 / 256)
+    assert learned("efficient", "mabl") == (100.0, 160 / 256)
+    assert learned("efficient", "mamba") == (100.0, 160 / 256)
+    assert learned("efficient", "qmix") == learned("quick", "qmix") == (0.0, 16 / 256)
+    assert learned("efficient", "mappo") == learned("quick", "mappo") == (0.0, 20 / 1024)
 
 
 def test_a_preset_without_settings_for_a_family_says_which_has_them():
