@@ -86,7 +86,7 @@ def draw(points: Points, file: Path) -> None:
 
     envs = sorted({env for env, _ in points})
     names = sorted({name for _, name in points})
-    colours = {name: plt.get_cmap("tab20")(i % 20) for i, name in enumerate(names)}
+    colours = {name: plt.get_cmap("tab20")(2 * i % 20 + i // 10) for i, name in enumerate(names)}
     columns = min(3, len(envs))
     rows = -(-len(envs) // columns)
     figure, axes = plt.subplots(rows, columns, figsize=(5 * columns, 3.6 * rows), squeeze=False)
