@@ -31,8 +31,9 @@ from mabl.nets.mlp import Linear
 from mabl.replay import Replay, sample_sequences
 from mabl.rows import TimeStep
 from mabl.training.programs import as_in_a_run, build
-from mabl.world_models.base import model_loss, observe_batch
+from mabl.world_models.loss import model_loss
 from mabl.world_models.mabl import MABL
+from mabl.world_models.sequences import observe_batch
 
 UPDATES = 3
 """Of the model in one call, as they follow each other in a cycle."""

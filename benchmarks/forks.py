@@ -27,7 +27,7 @@ from mabl.rows import TimeStep
 from mabl.runs import folder
 from mabl.runs.checkpoint import Checkpoints
 from mabl.training.programs import build
-from mabl.world_models.base import observe_sequence
+from mabl.world_models.sequences import observe_sequence
 
 ROWS, MAPS, RANDOM = 400, 16, 0.3
 """Rows of a lane, lanes of new maps, and how often trains act at random there."""

@@ -47,7 +47,7 @@ from mabl.runs.checkpoint import Checkpoints
 from mabl.training.loop import TrainState, repeat
 from mabl.training.programs import as_in_a_run, build
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
-from mabl.world_models.base import observe_sequence
+from mabl.world_models.sequences import observe_sequence
 
 Source = Literal["true", "learned"]
 EPISODES = 256

@@ -22,9 +22,10 @@ from mabl.replay import sample_sequences
 from mabl.rows import is_last
 from mabl.training.loop import Training, steps_in
 from mabl.types import Trajectory
-from mabl.world_models.base import WorldModelConfig, observe_sequence
+from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Predictions
 from mabl.world_models.mabl import MABL
+from mabl.world_models.sequences import observe_sequence
 
 LENGTH = 6
 

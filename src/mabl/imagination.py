@@ -15,8 +15,9 @@ from mabl.errors import require_between, require_positive
 from mabl.nets.categorical import still
 from mabl.nets.mlp import Features
 from mabl.types import PRNGKey, TeamView, Trajectory
-from mabl.world_models.base import WorldModel, WorldModelConfig, predict_step
+from mabl.world_models.base import WorldModel, WorldModelConfig
 from mabl.world_models.heads import Predictions
+from mabl.world_models.sequences import predict_step
 
 L = TypeVar("L")
 

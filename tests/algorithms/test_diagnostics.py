@@ -9,8 +9,9 @@ from mabl.envs.base import Discrete, EnvSpec
 from mabl.envs.counting import CountingEnv
 from mabl.rows import TimeStep
 from mabl.types import Metrics
-from mabl.world_models.base import WorldModelConfig, observe_sequence
+from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.mabl import MABL
+from mabl.world_models.sequences import observe_sequence
 
 
 def test_unexplained_is_squared_error_over_variance_where_the_mask_holds():

@@ -18,7 +18,7 @@ from mabl.envs.base import Discrete, EnvSpec
 from mabl.execution import executor_of
 from mabl.nets.mlp import dense
 from mabl.rows import TimeStep
-from mabl.world_models.base import observe_sequence
+from mabl.world_models.sequences import observe_sequence
 
 AGENTS, OBS, STEPS = 3, 5, 4
 SPEC = EnvSpec("stub", AGENTS, OBS, AGENTS * OBS, Discrete(4), 10, "score")

@@ -21,8 +21,8 @@ from mabl.imagination import imagine_trajectory
 from mabl.replay import sample_sequences
 from mabl.training.loop import Training
 from mabl.types import Replayed, TeamView, Trajectory
-from mabl.world_models.base import observe_sequence
 from mabl.world_models.mabl import MABL
+from mabl.world_models.sequences import observe_sequence
 
 TINY = MAPPOConfig(hidden=16, n_hidden=1, n_heads=2)
 

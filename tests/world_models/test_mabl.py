@@ -15,17 +15,12 @@ from mabl.losses.kl import balanced_kl
 from mabl.nets.categorical import Code, CodeShape
 from mabl.nets.mlp import MLP, dense
 from mabl.rows import TimeStep
-from mabl.world_models.base import (
-    WorldModelConfig,
-    decoder_losses,
-    model_loss,
-    observe_batch,
-    observe_sequence,
-    reward_loss,
-)
+from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads, Predictions
 from mabl.world_models.levels import Level
+from mabl.world_models.loss import decoder_losses, model_loss, reward_loss
 from mabl.world_models.mabl import MABL
+from mabl.world_models.sequences import observe_batch, observe_sequence
 
 SPEC = EnvSpec("stub", 3, 4, 5, Discrete(3), 10, "score")
 CONFIG = WorldModelConfig(hidden=16, n_hidden=1, n_categoricals=3, n_classes=4)

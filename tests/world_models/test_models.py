@@ -26,18 +26,14 @@ from mabl.nets.mlp import MLP, dense
 from mabl.replay import sample_sequences
 from mabl.rows import TimeStep
 from mabl.training.programs import build as build_training
-from mabl.world_models.base import (
-    WorldModelConfig,
-    decoder_losses,
-    kl_losses,
-    observe_batch,
-    observe_sequence,
-)
+from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.dreamer_v2 import DreamerV2
 from mabl.world_models.heads import Predictions
 from mabl.world_models.levels import Level, forget
+from mabl.world_models.loss import decoder_losses, kl_losses
 from mabl.world_models.mabl_sg import MABLSG
 from mabl.world_models.mamba import MAMBA, CommunicationConfig, Team
+from mabl.world_models.sequences import observe_batch, observe_sequence
 
 SPEC = EnvSpec("stub", 3, 4, 5, Discrete(3), 10, "score")
 CONFIG = WorldModelConfig(hidden=8, n_hidden=1, n_categoricals=3, n_classes=4)

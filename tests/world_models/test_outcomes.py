@@ -10,19 +10,14 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from tests.world_models.test_mabl import CONFIG, SPEC, some_rows
 
-from mabl.world_models.base import (
-    absorbing_loss,
-    followers,
-    model_loss,
-    observe_sequence,
-    predict_sequence,
-)
 from mabl.world_models.dreamer_v2 import DreamerV2
 from mabl.world_models.heads import Predictions
 from mabl.world_models.levels import Level, arriving
+from mabl.world_models.loss import absorbing_loss, model_loss
 from mabl.world_models.mabl import MABL
 from mabl.world_models.mabl_sg import MABLSG
 from mabl.world_models.mamba import MAMBA, CommunicationConfig
+from mabl.world_models.sequences import followers, observe_sequence, predict_sequence
 
 TRANSITION = replace(CONFIG, outcomes="transition", reward_input="both")
 

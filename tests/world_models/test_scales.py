@@ -11,10 +11,11 @@ from numpy.testing import assert_allclose
 from tests.world_models.test_mabl import CONFIG, SPEC, some_rows
 from tests.world_models.test_outcomes import batched, mamba
 
-from mabl.world_models.base import model_loss, obs_std, observe_sequence, with_scales
 from mabl.world_models.dreamer_v2 import DreamerV2
+from mabl.world_models.loss import model_loss
 from mabl.world_models.mabl import MABL
 from mabl.world_models.mabl_sg import MABLSG
+from mabl.world_models.sequences import obs_std, observe_sequence, with_scales
 
 SCALED = replace(CONFIG, standardise=True, activation="rms_silu")
 MODELS = [MABL, MABLSG, DreamerV2, mamba]

@@ -11,14 +11,9 @@ from mabl.envs.base import ActionSpace
 from mabl.nets.categorical import still
 from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey
-from mabl.world_models.base import (
-    WorldModel,
-    WorldModelConfig,
-    followers,
-    predict_sequence,
-    predict_step,
-)
+from mabl.world_models.base import WorldModel, WorldModelConfig
 from mabl.world_models.heads import Predictions
+from mabl.world_models.sequences import followers, predict_sequence, predict_step
 
 L = TypeVar("L")
 T = TypeVar("T")

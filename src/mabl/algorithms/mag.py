@@ -18,15 +18,10 @@ from mabl.nets.mlp import MLP, Features, parts_of, widths_of
 from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
 from mabl.types import Metrics, PRNGKey, Progress, Replayed, Trajectory
-from mabl.world_models.base import (
-    decoder_losses,
-    kl_losses,
-    obs_std,
-    observe_batch,
-    predict_sequence,
-)
 from mabl.world_models.heads import Predictions
+from mabl.world_models.loss import decoder_losses, kl_losses
 from mabl.world_models.mamba import Team
+from mabl.world_models.sequences import obs_std, observe_batch, predict_sequence
 
 
 class LookaheadLearner(NamedTuple):

@@ -23,13 +23,9 @@ from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
 from mabl.rows import TimeStep, is_last
 from mabl.types import Metrics, PRNGKey, Progress, Replayed, TeamView, Trajectory
-from mabl.world_models.base import (
-    WorldModel,
-    WorldModelConfig,
-    model_loss,
-    observe_sequence,
-    with_scales,
-)
+from mabl.world_models.base import WorldModel, WorldModelConfig
+from mabl.world_models.loss import model_loss
+from mabl.world_models.sequences import observe_sequence, with_scales
 
 N_DIAGNOSED = 128
 """Sequences that diagnostics look at."""

@@ -111,7 +111,7 @@ Choice = MaskedCategorical | CensoredNormal
 
 
 def has_choice(action: Array, available: Bool[Array, "*b A"]) -> Bool[Array, "*b"]:
-    """Where an agent could have done something else: `action` only tells the kind of space."""
+    """Mask of agents that have a choice; `action` only tells the kind of space."""
     kind = MaskedCategorical if jnp.issubdtype(action.dtype, jnp.integer) else CensoredNormal
     return kind.free(available)
 

@@ -40,7 +40,7 @@ class RecurrentQMIXConfig:
     td_lambda: float = 0.6
     """Lambda of the returns that values are regressed on; 0: one-step targets."""
     target_rate: float = 0.01
-    """How far target networks move towards the learned ones after each update."""
+    """Share of the way that target networks move towards the learned ones after each update."""
     batch_size: int = 32
     """Sequences in the batch of an update."""
     batch_length: int = 50

@@ -227,7 +227,7 @@ def _run(
 
 
 def learned_per_step(algorithm: Algorithm, n_model: int, n_policy: int, steps: int) -> Row:
-    """How much a cycle of `steps` environment steps learns from."""
+    """Metrics of how much a cycle of `steps` environment steps learns from."""
     return {
         "train/imagined_steps": n_policy * algorithm.imagined_steps,
         "train/replayed_rows_per_env_step": n_model * algorithm.model_rows / steps,
