@@ -143,7 +143,7 @@ class Oracle(NamedTuple):
         return TrainState(learner, replay, collectors, key, jnp.int32(0), jnp.int32(0))
 
     def executor(self, learner: Learner, greedy: bool = False) -> Executor:
-        """How the learner acts in the environment."""
+        """Executor of the learner's policy in the environment."""
         policy = self.algorithm.policy(learner)
         if self.parts.inputs == "observations":
             policy = Policy(Sight(self.algorithm.spec.obs_dim), policy.actor)

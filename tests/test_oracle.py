@@ -16,7 +16,7 @@ from tests.tiny import flags, tiny
 from mabl.training.programs import build
 
 SCALE = 10.0
-"""Of rewards, in the preset of the test environments."""
+"""Reward scale in the preset of the test environments."""
 
 
 def imagined(parts: Parts, algo: str = "mabl", **options):
@@ -57,7 +57,7 @@ def test_what_is_imagined_follows_the_rules_of_the_task(algo):
         trajectory.continues[going_on], (~ended * np.ones(2, bool))[going_on].astype(float)
     )
     assert (np.diff(t, axis=0)[going_on[..., 0]] == 1).all()
-    # Nothing counts past an end.
+    # Rows past an end have weight 0.
     after = np.concatenate([np.zeros_like(ended[:1]), ended[:-1]]).cumsum(0) > 0
     assert_array_equal(trajectory.weight, 1.0 - (after * np.ones(2)))
 

@@ -89,7 +89,7 @@ def play(algo: str, rows: TimeStep) -> tuple[jax.Array, jax.Array]:
 
 
 def learned_from(algo: str, rows: TimeStep) -> jax.Array:
-    """What training makes of each agent's rows `[STEPS, N, G]`: its critic's input, or Q_tot."""
+    """Input of training for each agent's rows `[STEPS, N, G]`: its critic's input, or Q_tot."""
     algorithm, learner = build(algo)
     if isinstance(algorithm, model_free.ModelFree):
         return model_free.critic_features(rows)

@@ -216,7 +216,7 @@ def networks(table: Any) -> QNetworks:
 
 
 def three_rows() -> TimeStep:
-    """Of one episode; the third is where agent 0 dies. State 0, 1, 2."""
+    """Rows of one episode; agent 0 dies at the third. State 0, 1, 2."""
     rows = jax.tree.map(lambda x: x[:3].copy(), some_rows())
     rows.terminated[:] = False
     rows.obs[..., 0] = [[0, 1], [2, 3], [4, 5]]

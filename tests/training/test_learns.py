@@ -14,7 +14,7 @@ from mabl.training.run import updates_due
 
 LAST_EPISODES, FIRST_EPISODES = 300, 200
 
-SEEDS = {"mamba": 3, "dreamer-v2": 3}
+SEEDS = {"mamba": 3}
 """Seeds of which one must learn, where not the first must: when agents that talk agree early, the
 last of them may be left behind, and rounding (the number of threads, say) decides on which seed."""
 

@@ -46,7 +46,7 @@ def test_outcomes_of_a_transition_know_the_action_and_not_what_the_row_shows(mak
         same = np.array_equal(getattr(before, name)[2], getattr(other_row, name)[2])
         assert same == (outcomes == "transition"), name
         assert not np.allclose(getattr(before, name)[2], getattr(other_action, name)[2]), name
-    # What is seen, offered and alive is decoded from the row's own latent in any case.
+    # Observation, availability, life and action are decoded from the row's own latent in any case.
     for name in ("obs", "available", "alive", "action"):
         assert not np.allclose(getattr(before, name)[2], getattr(other_row, name)[2]), name
 
@@ -126,7 +126,7 @@ def test_outcomes_of_rows_that_follow_nothing_do_not_count():
     # Predicted is 0, real is 1 in each of four rows: Huber's loss is .5
     rows = some_rows(4, first=(2,))._replace(reward=jnp.ones((4, 3)))
     assert_allclose(loss_of(batched(rows))["loss_reward"], 0.5, rtol=1e-6)
-    # Of the transitions, those to rows 1 and 3 count: row 0 has no row before, row 2 is a reset.
+    # Transitions to rows 1 and 3 count: row 0 has no row before, row 2 is a reset.
     masked = loss_of(batched(rows), outcomes="transition", overshooting=1.0)
     assert_allclose(masked["loss_reward"], 0.25, rtol=1e-6)
     assert_allclose(masked["loss_terminated"], np.log(2) / 2, rtol=1e-6)

@@ -25,7 +25,7 @@ N_DIAGNOSED = 128
 
 
 class QLearner(NamedTuple):
-    """All that learning changes."""
+    """Networks, target networks, optimiser state and epsilon."""
 
     online: QNetworks
     target: QNetworks
