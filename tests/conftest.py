@@ -16,6 +16,8 @@ os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # Ray's workers give way to whoever wants to compute, and never get far beside other tests.
 os.environ.setdefault("RAY_worker_niceness", "0")
+# As in `join_cluster`: each worker would install the project anew.
+os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
 # Together with optimisations off, above, this saves a third of the time to compile. Later versions
 # of jaxlib do not know the flag, and abort at one that they do not know.
 FLAG = "--xla_cpu_use_fusion_emitters=false"

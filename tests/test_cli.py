@@ -91,14 +91,6 @@ MISTAKES = {
     ),
     "infinite": (["train", "--mappo.clip=inf"], "--mappo.clip is inf: give a number above 0"),
     "heads": (["train", "--mappo.hidden=30"], "--mappo.hidden is 30: give a multiple of its 8"),
-    "overshooting": (
-        [
-            "train",
-            "--world-model.overshooting=1",
-            "--world-model.agent-prior-input=posterior",
-        ],
-        "--world-model.overshooting decodes what imagination would draw",
-    ),
     "epsilon": (
         ["train", "--algo=mabl-qmix", "--qmix.epsilon-start=0.1", "--qmix.epsilon-end=0.2"],
         "--qmix.epsilon-end is 0.2: give a number from 0 to 0.1",
