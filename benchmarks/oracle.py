@@ -86,6 +86,11 @@ class Parts(NamedTuple):
         return "learned" in (self.dynamics, self.reward, self.ends)
 
     @property
+    def simulated(self) -> bool:
+        """Whether imagination asks the simulator for anything."""
+        return "true" in (self.dynamics, self.reward, self.ends)
+
+    @property
     def model(self) -> bool:
         """Whether there is a world model at all."""
         return self.learned or self.inputs == "latents"
@@ -170,6 +175,8 @@ class Oracle(NamedTuple):
             )
 
         def update_policy(learner: Learner, key: PRNGKey) -> tuple[Learner, Metrics]:
+            if not self.parts.simulated:
+                return self.algorithm.update_policy(learner, experience, key)
             key_imagine, key_learn = jax.random.split(key)
             imagined = self.imagine(learner, replay, key_imagine)
             return self.algorithm.learn(learner, *imagined, key_learn, progress)
@@ -181,6 +188,11 @@ class Oracle(NamedTuple):
         )
         ended = {f"episodes/{name}": x.sum() for name, x in episodes._asdict().items()}
         return after, model_metrics | policy_metrics | ended
+
+    def diagnose(self, state: TrainState) -> Metrics:
+        """What `mabl train` tells of the world model now and then."""
+        rows = state.replay._replace(rows=state.replay.rows.row)
+        return self.algorithm.diagnose(state.learner, rows, jax.random.fold_in(state.key, 1))
 
     def collect(
         self, learner: Learner, collectors: Collector, key: PRNGKey
@@ -236,11 +248,10 @@ class Oracle(NamedTuple):
     ) -> Trajectory:
         """One imagined trajectory from a replayed step."""
         algorithm, parts = self.algorithm, self.parts
-        actor = algorithm.behaviour.actor(learner.behaviour)
+        actor, dream = algorithm.behaviour.actor(learner.behaviour), algorithm.dream(learner)
         scale = algorithm.config.training.reward_scale
         # SMAX's own random numbers aside, a trajectory of learned dynamics lives through what the
         # simulator makes of the same actions: from there come true rewards and ends.
-        simulated = "true" in (parts.dynamics, parts.reward, parts.ends)
 
         def step(carry: tuple, key: PRNGKey) -> tuple[tuple, tuple]:
             env_state, row, latent = carry
@@ -252,9 +263,9 @@ class Oracle(NamedTuple):
             reward = continues = after = None
             if parts.learned:
                 imagined = Imagined(latent, row.available, row.alive)
-                after, predicted = algorithm.dream(learner).step(imagined, action, key_model)
-                reward, continues = predicted.reward, 1 - jax.nn.sigmoid(predicted.terminated)
-            if simulated:
+                after, predicted = dream.step(imagined, action, key_model)
+                reward, continues = predicted.reward, dream.continues(predicted)
+            if parts.simulated:
                 env_state, true = self.env.step(
                     key_env, env_state, action.astype(algorithm.spec.action_space.dtype)
                 )
@@ -316,6 +327,7 @@ def run(arguments: list[str]) -> None:
         )
     oracle, plan = Oracle(training.env, training.algorithm, parts), config.training
     cycle = jax.jit(as_in_a_run(oracle.cycle, config), donate_argnums=0)
+    diagnose = jax.jit(as_in_a_run(oracle.diagnose, config))
     state = jax.jit(as_in_a_run(oracle.init, config))(jax.random.key(config.seed))
     if given.model:
         state = state._replace(learner=state.learner._replace(model=model_of(given.model)))
@@ -348,6 +360,8 @@ def run(arguments: list[str]) -> None:
                 or step >= config.total_steps
             ):
                 point |= played(oracle, state)
+                if parts.dynamics == "learned":
+                    point |= said(diagnose(state))
             point["cpu_seconds"] = round(time.process_time() - began, 1)
             say(point, given.json)
             sums = {}
@@ -361,12 +375,13 @@ def told(metrics: dict[str, float], sums: dict[str, float], score: str) -> dict[
         "episode_return": sums["episodes/episode_return"] / episodes,
         "episode_length": sums["episodes/length"] / episodes,
     }
-    learning = {
-        k.partition("/")[2]: v
-        for k, v in metrics.items()
-        if not k.startswith("episodes/") and math.isfinite(v)
-    }
-    return {k: round(v, 4) for k, v in (found | learning).items()}
+    return said(found | {k: v for k, v in metrics.items() if not k.startswith("episodes/")})
+
+
+def said(metrics: Metrics) -> dict[str, float]:
+    """Finite values, under the last part of their names."""
+    finite = {k.rpartition("/")[2]: float(v) for k, v in metrics.items() if math.isfinite(v)}
+    return {k: round(v, 4) for k, v in finite.items()}
 
 
 def played(oracle: Oracle, state: TrainState) -> dict[str, float]:

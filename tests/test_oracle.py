@@ -13,6 +13,7 @@ from benchmarks.oracle import Oracle, Parts
 from numpy.testing import assert_allclose, assert_array_equal
 from tests.tiny import flags, tiny
 
+from mabl.algorithms.base import Experience
 from mabl.training.programs import build
 
 SCALE = 10.0
@@ -81,6 +82,35 @@ def test_each_part_is_the_simulators_or_the_models(dynamics, reward, ends):
     available = trajectory.view.available[1:]
     assert not available[..., 3].any() or dynamics == "learned"
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(trajectory))
+
+
+def test_learned_ends_are_those_of_imagination():
+    own = imagined(Parts("latents", "true", "true", "learned"), team_end=False).continues
+    assert (own[..., 0] != own[..., 1]).all()
+    team = imagined(Parts("latents", "true", "true", "learned"), team_end=True).continues
+    assert_array_equal(team[..., 0], team[..., 1])
+    assert_allclose(team[0, :, 0], own[0].mean(-1), rtol=1e-5)
+
+
+def test_with_everything_learned_it_is_plain_training():
+    config = tiny("mabl")
+    training = build(config)
+    oracle = Oracle(training.env, training.algorithm, Parts("latents", *3 * ("learned",)))
+
+    @jax.jit
+    def run(key):
+        state = oracle.init(key)
+        state, _ = oracle.cycle(state, 0, 0, 1000)
+        after, _ = oracle.cycle(state, 0, 1, 1000)
+        rows = after.replay._replace(rows=after.replay.rows.row)
+        experience = Experience(rows, None, None, state.env_steps / 1000)
+        key_policy = jax.random.fold_in(jax.random.split(state.key, 4)[3], 0)
+        plain, _ = training.algorithm.update_policy(state.learner, experience, key_policy)
+        return after.learner, plain, oracle.diagnose(after)
+
+    oracles, plain, told = run(jax.random.key(0))
+    jax.tree.map(assert_array_equal, oracles, plain)
+    assert 1 <= told["behaviour/imagined_episode_length"] <= 4
 
 
 def test_qmix_learns_from_observations_and_the_state():

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
 from mabl.algorithms.diagnostics import DIAGNOSED_ROWS, diagnose, masked_mean
+from mabl.algorithms.imagined_episodes import compare_episodes
 from mabl.behaviour.base import Behaviour
 from mabl.devices import spread
 from mabl.envs.base import EnvSpec
@@ -141,11 +142,12 @@ class ModelBased(NamedTuple):
         return learner._replace(behaviour=behaviour), metrics
 
     def diagnose(self, learner: Learner, replay: Replay, key: PRNGKey) -> Metrics:
-        """How well the world model predicts sequences of the replay, and what is expected of them.
+        """How well the world model predicts sequences of the replay, and what it promises.
 
-        `behaviour/value_at_reset` is in the environment's units: it compares with episode returns.
+        Values at resets and imagined episodes are in the environment's units, to compare with the
+        episodes of training.
         """
-        key_sample, key_observe, key_diagnose = jax.random.split(key, 3)
+        key_sample, key_observe, key_diagnose, key_play = jax.random.split(key, 4)
         rows = sample_sequences(replay, key_sample, N_DIAGNOSED, DIAGNOSED_ROWS)
         latents = self._observe(learner, rows, key_observe)
         metrics = diagnose(
@@ -165,7 +167,17 @@ class ModelBased(NamedTuple):
             masked_mean(jax.vmap(jax.vmap(value))(latents, rows), rows.is_first)
             / self.config.training.reward_scale
         )
-        return metrics
+        promised = compare_episodes(
+            self.dream(learner),
+            Imagined(latents, rows.available, rows.alive),
+            rows,
+            self.spec.episode_limit,
+            self.config.training.reward_scale,
+            key_play,
+        )
+        if self.spec.score_name != "win_rate":
+            del promised["behaviour/imagined_win_rate"]
+        return metrics | promised
 
     def dream(self, learner: Learner) -> Dream:
         """The learner's model and policy, ready to imagine."""

@@ -14,9 +14,14 @@ EPISODES = 100
 """Episodes that a point of the training curves averages over."""
 
 PANELS = {
-    "score of training episodes": ("train/win_rate", "train/score"),
-    "return: real, and the critic's at resets": (
+    "score of training and imagined episodes": (
+        "train/win_rate",
+        "train/score",
+        "behaviour/imagined_win_rate",
+    ),
+    "return: real, imagined, and the critic's at resets": (
         "train/episode_return",
+        "behaviour/imagined_episode_return",
         "behaviour/value_at_reset",
     ),
     "entropy of the policy (nats)": ("behaviour/entropy",),
