@@ -6,9 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mabl.algorithms.diagnostics import masked_mean
 from mabl.imagination import Dream, Imagined
-from mabl.rows import TimeStep, is_last
 from mabl.types import Metrics, PRNGKey
 
 EPISODES = 64
@@ -16,69 +14,68 @@ EPISODES = 64
 
 
 class Episode(NamedTuple):
-    """An imagined episode, as far as it has gone."""
+    """An imagined episode so far; every step counts with the probability that it is reached."""
 
-    episode_return: Float[Array, "*b"]
-    """Sum of rewards, mean over agents, scaled units."""
+    reached: Float[Array, "*b"]
+    """Probability that no end was reached yet."""
+    total_reward: Float[Array, "*b"]
+    """Mean over agents, scaled units."""
     length: Float[Array, "*b"]
     """Joint steps."""
-    last_reward: Float[Array, "*b"]
-    """Of the step that ended it, mean over agents, scaled units."""
-    ended: Bool[Array, "*b"]
-    """False if the limit cut it."""
+    score: Float[Array, "*b"]
+    """Expected score of the ends; an episode that the limit cuts scores 0."""
 
 
 def imagine_episode(dream: Dream, start: Imagined, limit: int, key: PRNGKey) -> Episode:
-    """Play the policy in the model from one state until an end is drawn, `limit` steps at most."""
+    """Play the policy in the model for `limit` steps from one state; the caller vmaps."""
 
     def advance(
         carry: tuple[Imagined, Episode], key: PRNGKey
     ) -> tuple[tuple[Imagined, Episode], None]:
-        state, episode = carry
-        key_action, key_step, key_end = jax.random.split(key, 3)
+        state, so_far = carry
+        key_action, key_step = jax.random.split(key)
         action, _ = dream.act(state, key_action)
         state, predicted = dream.step(state, action, key_step)
-        reward = predicted.reward.mean()
-        ends = jax.random.uniform(key_end) >= dream.continues(predicted).mean()
+        goes_on = so_far.reached * dream.continues(predicted).mean()
+        score = 0.0 if predicted.score is None else jax.nn.sigmoid(predicted.score).mean()
         after = Episode(
-            episode.episode_return + reward, episode.length + 1, last_reward=reward, ended=ends
+            reached=goes_on,
+            total_reward=so_far.total_reward + so_far.reached * predicted.reward.mean(),
+            length=so_far.length + so_far.reached,
+            score=so_far.score + (so_far.reached - goes_on) * score,
         )
-        kept = jax.tree.map(lambda old, new: jnp.where(episode.ended, old, new), episode, after)
-        return (state, kept), None
+        return (state, after), None
 
-    zero = jnp.zeros(())
-    fresh = Episode(zero, zero, zero, jnp.zeros((), bool))
+    fresh = Episode(jnp.ones(()), *jnp.zeros((3, 1))[:, 0])
     return jax.lax.scan(advance, (start, fresh), jax.random.split(key, limit))[0][1]
 
 
-def compare_episodes(
+def imagined_episodes(
     dream: Dream,
     states: Imagined,
-    rows: TimeStep,
+    is_first: Bool[Array, "*b"],
     limit: int,
     reward_scale: float,
     key: PRNGKey,
 ) -> Metrics:
-    """Return, length and win rate of imagined episodes, in the environment's units.
+    """Means over imagined episodes, in the environment's units.
 
-    `states` `[B, T, ...]` are those of the rows `[B, T]`. Episodes start from rows that begin one,
-    drawn with replacement; without such rows all values are NaN. A win is an imagined end whose
-    reward is nearer to the mean reward of the replayed wins (`score` above 0) than to that of the
-    other ends: NaN while the rows do not hold both.
+    They start from `states` `[*b, ...]` that begin an episode, drawn with replacement; all values
+    are NaN if none does.
     """
-    first = rows.is_first.ravel()
     key_start, key_play = jax.random.split(key)
+    first = is_first.ravel()
     which = jax.random.categorical(key_start, jnp.log(1.0 * first), shape=(EPISODES,))
-    start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[which], states)
-    keys = jax.random.split(key_play, EPISODES)
-    played = jax.vmap(lambda *at: imagine_episode(dream, at[0], limit, at[1]))(start, keys)
-    reward, won = rows.reward.mean(-1), jnp.nan_to_num(rows.score) > 0
-    lost = is_last(rows) & ~won
-    threshold = (masked_mean(reward, won) + masked_mean(reward, lost)) / 2
-    wins = jnp.where(jnp.isnan(threshold), jnp.nan, played.ended & (played.last_reward > threshold))
+    start = jax.tree.map(lambda x: x.reshape(-1, *x.shape[is_first.ndim :])[which], states)
+    played = jax.vmap(lambda start, key: imagine_episode(dream, start, limit, key))(
+        start, jax.random.split(key_play, EPISODES)
+    )
     told = {
-        "imagined_episode_return": played.episode_return.mean() / reward_scale,
-        "imagined_episode_length": played.length.mean(),
-        "imagined_win_rate": wins.mean(),
+        "return": played.total_reward / reward_scale,
+        "length": played.length,
+        "score": played.score,
     }
-    return {f"behaviour/{k}": jnp.where(first.any(), v, jnp.nan) for k, v in told.items()}
+    return {
+        f"behaviour/imagined_episode_{name}": jnp.where(first.any(), value.mean(), jnp.nan)
+        for name, value in told.items()
+    }

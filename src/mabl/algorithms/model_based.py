@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
 from mabl.algorithms.diagnostics import DIAGNOSED_ROWS, diagnose, masked_mean
-from mabl.algorithms.imagined_episodes import compare_episodes
+from mabl.algorithms.imagined_episodes import imagined_episodes
 from mabl.behaviour.base import Behaviour
 from mabl.devices import spread
 from mabl.envs.base import EnvSpec
@@ -167,16 +167,16 @@ class ModelBased(NamedTuple):
             masked_mean(jax.vmap(jax.vmap(value))(latents, rows), rows.is_first)
             / self.config.training.reward_scale
         )
-        promised = compare_episodes(
+        promised = imagined_episodes(
             self.dream(learner),
             Imagined(latents, rows.available, rows.alive),
-            rows,
+            rows.is_first,
             self.spec.episode_limit,
             self.config.training.reward_scale,
             key_play,
         )
-        if self.spec.score_name != "win_rate":
-            del promised["behaviour/imagined_win_rate"]
+        if not self.spec.score_is_share:
+            del promised["behaviour/imagined_episode_score"]
         return metrics | promised
 
     def dream(self, learner: Learner) -> Dream:

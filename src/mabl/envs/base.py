@@ -90,6 +90,11 @@ class EnvSpec:
     action_dims: tuple[int, ...] = ()
     """Each agent's own number of actions, where they differ; the rest is never available."""
 
+    @property
+    def score_is_share(self) -> bool:
+        """Whether scores are from [0, 1]: battles won, or trains that arrived."""
+        return self.score_name in ("win_rate", "arrived")
+
 
 @runtime_checkable
 class Drawing(Protocol):

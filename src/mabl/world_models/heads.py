@@ -7,7 +7,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mabl.nets.mlp import MLP, Activation, Features, Linear, Widths, activate, parts_of
+from mabl.nets.categorical import still
+from mabl.nets.mlp import (
+    MLP,
+    Activation,
+    Features,
+    Linear,
+    Part,
+    Widths,
+    activate,
+    parts_of,
+)
 from mabl.types import PRNGKey
 
 
@@ -27,6 +37,8 @@ class Predictions(NamedTuple):
     """Logit of p(alive)."""
     action: Float[Array, "*b A"]
     """The agent's own previous action: logits if discrete, mean if continuous."""
+    score: Float[Array, "*b"] | None = None
+    """Logit of the score with which an episode that ends here ends, where scores are shares."""
 
 
 class Heads(eqx.Module):
@@ -34,7 +46,7 @@ class Heads(eqx.Module):
 
     With `both_levels_reward` a second reward predictor sees both levels; ADR 4 says why. Life comes
     from the decoder of availability, as one Bernoulli more (ADR 9). First layers that see the same
-    are computed as one.
+    are computed as one. With `scored` there is a predictor of the score, for diagnostics alone.
     """
 
     agent_in: Linear
@@ -45,6 +57,8 @@ class Heads(eqx.Module):
     available: MLP
     action: MLP
     full_reward: MLP | None
+    score: MLP | None
+    """A diagnostic: its loss trains nothing before it."""
 
     def __init__(
         self,
@@ -55,6 +69,7 @@ class Heads(eqx.Module):
         hidden: int,
         n_hidden: int,
         both_levels_reward: bool,
+        scored: bool,
         key: PRNGKey,
         activation: Activation = "relu",
     ):
@@ -76,6 +91,10 @@ class Heads(eqx.Module):
         self.full_in, rest = decoders(full, sizes, keys[2 : 2 + len(sizes)])
         self.terminated, self.available, self.action = rest[:3]
         self.full_reward = rest[3] if both_levels_reward else None
+        self.score = None
+        if scored:
+            key_score = jax.random.fold_in(key, 1)
+            self.score = MLP(full, 1, hidden, n_hidden, key_score, activation=activation)
 
     def __call__(self, agent: Features, full: Features) -> Predictions:
         """Decode one agent's latents: its own level, and all levels."""
@@ -98,4 +117,10 @@ class Heads(eqx.Module):
             available=offered[:-1],
             alive=offered[-1],
             action=self.action(action),
+            score=None if self.score is None else self.score(*detached(full))[0],
         )
+
+
+def detached(features: Features) -> tuple[Part, ...]:
+    """Features through which no gradient flows."""
+    return jax.lax.stop_gradient(still(parts_of(features)))

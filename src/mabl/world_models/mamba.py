@@ -213,6 +213,7 @@ class DecoderNets(eqx.Module):
             hidden=hidden,
             n_hidden=config.n_hidden,
             both_levels_reward=False,
+            scored=spec.score_is_share,
             key=key_heads,
             activation=config.activation,
         )
