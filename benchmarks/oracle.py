@@ -215,13 +215,10 @@ class Oracle(NamedTuple):
         self, learner: Learner, replay: Replay, key: PRNGKey
     ) -> tuple[Trajectory, Replayed]:
         """`ModelBased.imagine`, with the simulator in the place of the model's parts."""
-        sizes, n_starts = (
-            self.algorithm.config.world_model,
-            self.algorithm.config.imagination.n_starts,
-        )
+        sizes, plan = self.algorithm.config.world_model, self.algorithm.config.imagination
         key_sample, key_observe, key_start, key_imagine = jax.random.split(key, 4)
         recorded = replays.sample_sequences(
-            replay, key_sample, sizes.batch_size, sizes.batch_length
+            replay, key_sample, sizes.batch_size, sizes.batch_length, plan.recency
         )
         latents = None
         if self.parts.model:
@@ -234,7 +231,9 @@ class Oracle(NamedTuple):
             ((recorded.env_state, recorded.row, latents), 1.0 - is_last(recorded.row)),
         )
         order = jax.random.permutation(key_start, flat[1].shape[0])
-        order = order[jnp.argsort(-flat[1][order], stable=True)][: n_starts or flat[1].shape[0]]
+        order = order[jnp.argsort(-flat[1][order], stable=True)][
+            : plan.n_starts or flat[1].shape[0]
+        ]
         begin, weight = jax.tree.map(lambda x: x[order], flat)
         keys = jax.random.split(key_imagine, weight.shape[0])
         trajectory = jax.vmap(lambda *start: self.trajectory(learner, *start), out_axes=1)(

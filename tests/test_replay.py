@@ -3,9 +3,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mabl import replay as replays
 from mabl.envs.counting import CountingEnv
@@ -128,6 +129,20 @@ def test_a_sequence_may_be_as_long_as_the_ring():
     replay, _ = filled([(4,), (4,), (3,)])
     sequences = ids_of(sample(replay, jax.random.key(0), 5, CAPACITY))
     assert_array_equal(sequences, [[4, 5, 6, 7, 8, 9, 10]] * 5)
+
+
+@pytest.mark.parametrize("recency", [1.0, 2.0, 4.0])
+def test_recent_rows_are_drawn_more_often(recency):
+    replay, added = filled([(4, 3), (4, 4), (3, 2)])  # both rings have gone round
+    drawn = jax.jit(replays.sample_sequences, static_argnums=(2, 3, 4))
+    ids = ids_of(drawn(replay, jax.random.key(0), 20_000, LENGTH, recency))
+    assert (np.diff(ids, axis=1) == 1).all()  # never across the seam
+    lane = ids[:, 0] // 100
+    assert abs(lane.mean() - 0.5) < 0.02
+    oldest = np.array([min(kept[-CAPACITY:]) for kept in added])
+    counts = np.bincount(ids[:, 0] - oldest[lane], minlength=CAPACITY - LENGTH + 1) / len(ids)
+    edges = np.linspace(0, 1, CAPACITY - LENGTH + 2) ** recency
+    assert_allclose(counts, np.diff(edges), atol=0.015)
 
 
 def test_sequences_cross_episodes():

@@ -32,6 +32,9 @@ class ImaginationConfig:
     """Rows of an imagined trajectory, the start included."""
     n_starts: int | None = None
     """Start states drawn from the posterior states of a batch; None: all, as in the paper."""
+    recency: float = 1.0
+    """How much more often than at the average row imagination starts at the newest one; 1: at all
+    rows alike, as in the paper."""
     sample_availability: bool = True
     """Sample the availability of imagined actions, as in the paper, or take its mode."""
     sample_life: bool = False
@@ -44,6 +47,7 @@ class ImaginationConfig:
     def __post_init__(self) -> None:
         require_positive(self, "n_starts")
         require_between(self, 2, inf, "horizon")
+        require_between(self, 1, inf, "recency")
 
 
 class Imagined(NamedTuple, Generic[L]):

@@ -57,8 +57,13 @@ def cut(replay: Replay, truncated: Bool[Array, ""]) -> Replay:
     return replay._replace(rows=rows._replace(truncated=now))
 
 
-def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int) -> Any:
-    """Draw `[B, T, ...]` uniformly from all runs of `length` rows, over all lanes `[E, C, ...]`.
+def sample_sequences(
+    replay: Replay, key: PRNGKey, batch_size: int, length: int, recency: float = 1.0
+) -> Any:
+    """Draw `[B, T, ...]` from all runs of `length` rows, over all lanes `[E, C, ...]`.
+
+    With `recency` 1 all are equally likely; with p the newest of a lane is drawn p times as often
+    as the average one, and one with a share x of the lane before it p x^(p-1) times.
 
     Sequences cross episode boundaries (`is_first` marks them) but never the ring's seam. Some lane
     must hold at least `length` rows.
@@ -69,6 +74,9 @@ def sample_sequences(replay: Replay, key: PRNGKey, batch_size: int, length: int)
     pick = jax.random.randint(key, (batch_size,), 0, ends[-1])
     lane = jnp.searchsorted(ends, pick, side="right")
     age = pick - (ends - starts)[lane]
+    if recency != 1.0:
+        share = jax.random.uniform(jax.random.fold_in(key, 1), (batch_size,)) ** (1 / recency)
+        age = jnp.minimum((share * starts[lane]).astype(age.dtype), starts[lane] - 1)
     oldest = (replay.cursor - replay.size)[lane]
     index = ((oldest + age)[:, None] + jnp.arange(length)[None]) % capacity
     return spread(jax.tree.map(lambda x: x[lane[:, None], index], replay.rows))

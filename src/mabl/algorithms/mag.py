@@ -95,7 +95,11 @@ class MAG(NamedTuple):
         base, metrics = self.base.update_model(learner.base, experience, key_model)
         config = self.config.world_model
         rows = sample_sequences(
-            experience.replay, key_sample, config.batch_size, config.batch_length
+            experience.replay,
+            key_sample,
+            config.batch_size,
+            config.batch_length,
+            config.recency,
         )
         rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)
         observed = observe_batch(base.model, rows, key_observe)

@@ -90,7 +90,11 @@ class ModelBased(NamedTuple):
         config = self.config.world_model
         key_sample, key_loss = jax.random.split(key)
         rows = sample_sequences(
-            experience.replay, key_sample, config.batch_size, config.batch_length
+            experience.replay,
+            key_sample,
+            config.batch_size,
+            config.batch_length,
+            config.recency,
         )
         model = with_scales(learner.model, rows)
         gradient, metrics = eqx.filter_grad(model_loss, has_aux=True)(
@@ -115,7 +119,13 @@ class ModelBased(NamedTuple):
         """Trajectories from the latents of B_R sequences, and these sequences (lines 10-11)."""
         sizes = self.config.world_model
         key_sample, key_observe, key_start, key_imagine = jax.random.split(key, 4)
-        rows = sample_sequences(replay, key_sample, sizes.batch_size, sizes.batch_length)
+        rows = sample_sequences(
+            replay,
+            key_sample,
+            sizes.batch_size,
+            sizes.batch_length,
+            self.config.imagination.recency,
+        )
         latents = self._observe(learner, rows, key_observe)
         start, weight = spread(starts(latents, rows, key_start, self.config.imagination.n_starts))
         dream = self.dream(learner)

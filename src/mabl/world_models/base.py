@@ -76,6 +76,9 @@ class WorldModelConfig:
     """Largest global norm of the gradient."""
     batch_size: int = 40
     """Sequences in a model update."""
+    recency: float = 1.0
+    """How much more often than the average row the newest one is replayed; 1: all rows alike, as in
+    the paper."""
     batch_length: int = 20
     """Rows of a sequence, 2 at least."""
 
@@ -88,6 +91,7 @@ class WorldModelConfig:
         require_positive(self, "hidden", "n_hidden", "n_categoricals", "n_classes", "batch_size")
         require_positive(self, "learning_rate", "grad_clip")
         require_between(self, 2, inf, "batch_length")
+        require_between(self, 1, inf, "recency")
         require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
         require_between(self, 0, inf, "free_nats", "obs_weight", "overshooting")
         require_between(self, 0, inf, "reward_weight", "agent_reward_weight", "end_weight")
