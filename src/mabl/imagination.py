@@ -94,7 +94,7 @@ class Dream(NamedTuple):
             available = jax.nn.sigmoid(predicted.available) > threshold
         drawn = jax.random.uniform(key_alive, state.alive.shape) if self.config.sample_life else 0.5
         alive = state.alive & (jax.nn.sigmoid(predicted.alive) > drawn)
-        return Imagined(latent, available, alive), predicted
+        return Imagined(self.model.with_life(latent, alive), available, alive), predicted
 
     def continues(self, predicted: Predictions) -> Float[Array, " N"]:
         """Each agent's probability that the episode goes on after a row."""

@@ -22,6 +22,7 @@ from mabl.envs.base import Discrete, EnvSpec
 from mabl.errors import UserError
 from mabl.imagination import Dream, ImaginationConfig, Imagined
 from mabl.losses.kl import categorical_kl
+from mabl.nets.categorical import still
 from mabl.nets.mlp import MLP, dense
 from mabl.replay import sample_sequences
 from mabl.rows import TimeStep
@@ -620,6 +621,20 @@ def test_who_is_predicted_to_die_is_not_heard_from_the_next_step_on():
     assert_array_equal(after.alive, [True, False, True])
 
 
+@pytest.mark.parametrize(("sample", "share"), [(True, 0.8), (False, 1.0)])
+def test_who_is_drawn_dead_in_imagination_is_not_heard_from(sample, share):
+    model = living(build("mamba"), float(np.log(4.0)))  # alive with probability .8
+    start = at(observed(model, some_rows(4)).latents, 1)
+    config = ImaginationConfig(sample_life=sample)
+    dream = Dream(model, None, SPEC.action_space, config, CONFIG, lambda latent: ())  # pyright: ignore
+    latent = still(jax.tree.map(jnp.asarray, start))
+    state = Imagined(latent, jnp.ones((3, 3), bool), jnp.ones(3, bool))
+    step = jax.jit(lambda key: dream.step(state, jnp.array([0, 1, 2]), key)[0])
+    after = jax.device_get(jax.vmap(step)(jax.random.split(jax.random.key(0), 200)))
+    assert_array_equal(after.latent.alive, after.alive)
+    assert abs(after.alive.mean() - share) < 0.06
+
+
 def test_in_mag_who_dies_is_each_agents_own_prediction():
     start = at(observed(build("mag"), some_rows(4)).latents, 1)
     model = living(build("mag"), jnp.array([100.0, -100.0, 100.0]))
@@ -745,6 +760,9 @@ class Forking(eqx.Module):
     Start 1 has start 0's kinds in another order. Agent 0's feature is twice what is feared of the
     row, agent 1's the negative of it; after action 0, all is reversed.
     """
+
+    def with_life(self, latent, alive):
+        return latent
 
     def imagine(self, latent: Fork, action: Array, key: Array) -> Fork:
         kind = jnp.where(latent.row == 0, jax.random.randint(key, (), 0, 3), latent.kind)

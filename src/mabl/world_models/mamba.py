@@ -278,10 +278,14 @@ class MAMBA(eqx.Module):
         return Latent(level, latent.alive), {"agent": logits}
 
     def imagine(self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey) -> Latent:
-        """Prior latents of the next row; who dies in it is not heard from then on."""
+        """Prior latents of the next row; who is likelier dead than alive is not heard after it."""
         h = self.filter.recur(latent, action)
         after = still(self.prior(Latent(Level(h, latent.level.z), latent.alive), key)[0])
         return after._replace(alive=latent.alive & (self.predict(after).alive > 0))
+
+    def with_life(self, latent: Latent, alive: Bool[Array, " N"]) -> Latent:
+        """Agents that are not alive are not heard from then on."""
+        return latent._replace(alive=alive)
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent from its own latent."""
