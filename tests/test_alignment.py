@@ -222,9 +222,6 @@ class Clockwork(eqx.Module):
     def critic_features(self, latent):
         return 10.0 * latent.count[:, None]
 
-    def with_life(self, latent, alive):
-        return latent
-
     def imagine(self, latent, action, key):
         return Counter(latent.count + 1, action.argmax(-1))
 

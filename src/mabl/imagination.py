@@ -94,7 +94,10 @@ class Dream(NamedTuple):
             available = jax.nn.sigmoid(predicted.available) > threshold
         drawn = jax.random.uniform(key_alive, state.alive.shape) if self.config.sample_life else 0.5
         alive = state.alive & (jax.nn.sigmoid(predicted.alive) > drawn)
-        return Imagined(self.model.with_life(latent, alive), available, alive), predicted
+        with_life = getattr(self.model, "with_life", None)
+        if with_life is not None:  # who lives is part of the model's latent
+            latent = with_life(latent, alive)
+        return Imagined(latent, available, alive), predicted
 
     def continues(self, predicted: Predictions) -> Float[Array, " N"]:
         """Each agent's probability that the episode goes on after a row."""

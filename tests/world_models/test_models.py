@@ -761,9 +761,6 @@ class Forking(eqx.Module):
     row, agent 1's the negative of it; after action 0, all is reversed.
     """
 
-    def with_life(self, latent, alive):
-        return latent
-
     def imagine(self, latent: Fork, action: Array, key: Array) -> Fork:
         kind = jnp.where(latent.row == 0, jax.random.randint(key, (), 0, 3), latent.kind)
         return Fork(latent.start, kind, latent.row + 1, action[0].argmax())

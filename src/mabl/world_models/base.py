@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mabl.errors import require_between, require_positive
 from mabl.nets.categorical import CodeShape
@@ -127,10 +127,6 @@ class WorldModel(Protocol[L]):
 
     def imagine(self, latent: L, action: Float[Array, "N A"], key: PRNGKey) -> L:
         """Prior latent of the next row after an encoded joint action."""
-        ...
-
-    def with_life(self, latent: L, alive: Bool[Array, " N"]) -> L:
-        """An imagined latent when these agents live; unchanged where the model keeps no life."""
         ...
 
     def predict(self, latent: L) -> Predictions:

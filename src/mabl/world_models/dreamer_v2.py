@@ -94,11 +94,6 @@ class DreamerV2(eqx.Module):
         h = jax.vmap(self.filter.recurrent)(latent, action)
         return still(self.prior(latent._replace(h=h), key)[0])
 
-    def with_life(self, latent: Level, alive: Bool[Array, " N"]) -> Level:
-        """The same: life is no part of it."""
-        del alive
-        return latent
-
     def predict(self, latent: Level) -> Predictions:
         """Decode a row for every agent from its own latent."""
         predicted = jax.vmap(self.heads)(latent.features(), latent.features())

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mabl.envs.base import EnvSpec
 from mabl.nets.categorical import Code, draw, still
@@ -128,11 +128,6 @@ class MABL(eqx.Module):
             "agent": agent_logits,
             "global": global_logits,
         }
-
-    def with_life(self, latent: Latent, alive: Bool[Array, " N"]) -> Latent:
-        """The same: life is no part of it."""
-        del alive
-        return latent
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent: fields `[N, ...]`.

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mabl.envs.base import EnvSpec
 from mabl.nets.categorical import Code, draw, still
@@ -95,11 +95,6 @@ class MABLSG(eqx.Module):
         agent_logits = agent_prior(latent.agent.h, global_.z)
         agent = Level(latent.agent.h, draw(agent_logits, key_agents))
         return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
-
-    def with_life(self, latent: Latent, alive: Bool[Array, " N"]) -> Latent:
-        """The same: life is no part of it."""
-        del alive
-        return latent
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent from its own level and the team's."""

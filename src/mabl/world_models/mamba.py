@@ -284,7 +284,7 @@ class MAMBA(eqx.Module):
         return after._replace(alive=latent.alive & (self.predict(after).alive > 0))
 
     def with_life(self, latent: Latent, alive: Bool[Array, " N"]) -> Latent:
-        """Agents that are not alive are not heard from then on."""
+        """An imagined latent when these agents live; the others are not heard from then on."""
         return latent._replace(alive=alive)
 
     def predict(self, latent: Latent) -> Predictions:
