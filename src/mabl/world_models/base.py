@@ -101,7 +101,8 @@ class WorldModelConfig:
 class WorldModel(Protocol[L]):
     """A latent-variable model of a team; one example, the caller vmaps over the batch.
 
-    `L` is the latent: a pytree of the whole team's.
+    `L` is the latent: a pytree of the whole team's. A model whose latent holds who lives, like
+    MAMBA's, also has `with_life(latent, alive)`, by which imagination tells it who was drawn alive.
     """
 
     filter: Any
