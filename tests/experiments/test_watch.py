@@ -192,7 +192,9 @@ class TestCurves:
         append(run, line(3_000, **{"behaviour/entropy": 1.5, "world_model/loss": 9.0}))
         board = Watch(tmp_path)
         lines = board.curves([run])[run]
-        assert lines["score of training episodes"] == [("arrived", [(1_000, 0), (2_000, 0.5)])]
+        assert lines["score of training and imagined episodes"] == [
+            ("arrived", [(1_000, 0), (2_000, 0.5)])
+        ]
         assert lines["entropy of the policy (nats)"] == [("entropy", [(3_000, 1.5)])]
         assert lines["KL (nats)"] == []
         append(run, line(4_000, **{"behaviour/entropy": 1.0}))

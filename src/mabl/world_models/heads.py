@@ -69,9 +69,9 @@ class Heads(eqx.Module):
         hidden: int,
         n_hidden: int,
         both_levels_reward: bool,
-        scored: bool,
         key: PRNGKey,
         activation: Activation = "relu",
+        scored: bool = False,
     ):
         """`agent` and `full` are the widths of what decoders see: its own level, and all levels."""
         keys = jax.random.split(key, 6)
