@@ -39,6 +39,9 @@ class WorldModelConfig:
     standardise: bool = False
     """Standardise observations and states by their running mean and variance, for encoders and for
     the observations' loss."""
+    policy_input: Literal["latent", "decoded"] = "latent"
+    """What policies and critics see: the latent (z, h) as in the paper, or also the observation
+    decoded from it, which means the same while the codes change as the model learns."""
     obs_weight: float = 1.0
     """Weight of the observations' loss."""
     outcomes: Literal["row", "transition"] = "row"

@@ -7,13 +7,21 @@ import jax
 from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import EnvSpec
-from mabl.nets.mlp import MLP
+from mabl.nets.mlp import MLP, Features, parts_of
 from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
-from mabl.world_models.heads import Heads
-from mabl.world_models.levels import AgentFilter, Categoricals, Level, Recurrent, standardised
+from mabl.world_models.heads import Heads, Predictions
+from mabl.world_models.levels import (
+    AgentFilter,
+    Categoricals,
+    Level,
+    Recurrent,
+    policy_decoder,
+    restored,
+    standardised,
+)
 
 
 class Latent(NamedTuple):
@@ -51,7 +59,14 @@ class BiLevel(eqx.Module):
         hidden, latent = config.hidden, config.latent
         action_dim = spec.action_space.size
         self.filter = AgentFilter(
-            spec.obs_dim, action_dim, hidden, latent, keys[0], config.standardise, config.activation
+            spec.obs_dim,
+            action_dim,
+            hidden,
+            latent,
+            keys[0],
+            config.standardise,
+            config.activation,
+            policy_decoder(config, spec.obs_dim, jax.random.fold_in(keys[0], 1)),
         )
         self.state_scale = Normaliser.fresh(spec.state_dim) if config.standardise else None
         activation = config.activation
@@ -68,7 +83,7 @@ class BiLevel(eqx.Module):
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, latent, hidden, hidden),
-            obs_dim=spec.obs_dim,
+            obs_dim=spec.obs_dim if config.policy_input == "latent" else None,
             action_dim=action_dim,
             hidden=hidden,
             n_hidden=config.n_hidden,
@@ -77,6 +92,12 @@ class BiLevel(eqx.Module):
             key=keys[6],
             activation=activation,
         )
+
+    def predict(self, agent: Level, full: Features) -> Predictions:
+        """One agent's predictions of a row, in the environment's units."""
+        seen = parts_of(self.filter.features(agent))
+        predicted = self.heads(seen[:2], full, *seen[2:])
+        return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
 
     def encode(self, row: TimeStep, spec: EnvSpec) -> Inputs:
         """Encode actions, observations and the state of one row."""

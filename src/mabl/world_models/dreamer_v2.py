@@ -8,12 +8,20 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import EnvSpec
 from mabl.nets.categorical import draw, still
-from mabl.nets.mlp import Features
+from mabl.nets.mlp import Features, parts_of
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads, Predictions
-from mabl.world_models.levels import AgentFilter, Categoricals, Level, forget, restored, team_of
+from mabl.world_models.levels import (
+    AgentFilter,
+    Categoricals,
+    Level,
+    forget,
+    policy_decoder,
+    restored,
+    team_of,
+)
 
 
 class Inputs(NamedTuple):
@@ -47,12 +55,13 @@ class DreamerV2(eqx.Module):
             keys[0],
             config.standardise,
             config.activation,
+            policy_decoder(config, spec.obs_dim, jax.random.fold_in(keys[0], 1)),
         )
         self.agent_prior = Categoricals((hidden,), hidden, latent, keys[1], config.activation)
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, hidden),
-            obs_dim=spec.obs_dim,
+            obs_dim=spec.obs_dim if config.policy_input == "latent" else None,
             action_dim=spec.action_space.size,
             hidden=hidden,
             n_hidden=config.n_hidden,
@@ -96,13 +105,14 @@ class DreamerV2(eqx.Module):
 
     def predict(self, latent: Level) -> Predictions:
         """Decode a row for every agent from its own latent."""
-        predicted = jax.vmap(self.heads)(latent.features(), latent.features())
+        seen = parts_of(self.actor_features(latent))
+        predicted = jax.vmap(self.heads)(seen[:2], seen[:2], *seen[2:])
         return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
 
     def actor_features(self, latent: Level) -> Features:
-        """(z, h)."""
-        return latent.features()
+        """(z, h), and what else the policy sees."""
+        return jax.vmap(self.filter.features)(latent)
 
     def critic_features(self, latent: Level) -> Features:
-        """(z, h): there is nothing else."""
-        return latent.features()
+        """What policies see: there is nothing else."""
+        return self.actor_features(latent)

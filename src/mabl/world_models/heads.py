@@ -1,6 +1,6 @@
 """Observation model and auxiliary components (section 3.1.2): what a latent says of the world."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -51,7 +51,8 @@ class Heads(eqx.Module):
 
     agent_in: Linear
     full_in: Linear
-    obs: MLP
+    obs: MLP | None
+    """None where the filter has it."""
     agent_reward: MLP
     terminated: MLP
     available: MLP
@@ -64,7 +65,7 @@ class Heads(eqx.Module):
         self,
         agent: Widths,
         full: Widths,
-        obs_dim: int,
+        obs_dim: int | None,
         action_dim: int,
         hidden: int,
         n_hidden: int,
@@ -73,7 +74,10 @@ class Heads(eqx.Module):
         activation: Activation = "relu",
         scored: bool = False,
     ):
-        """`agent` and `full` are the widths of what decoders see: its own level, and all levels."""
+        """`agent` and `full` are the widths of what decoders see: its own level, and all levels.
+
+        Without `obs_dim` there is no decoder of observations.
+        """
         keys = jax.random.split(key, 6)
 
         def decoders(seen: Widths, sizes: tuple[int, ...], keys: Array) -> tuple[Linear, list[MLP]]:
@@ -86,7 +90,10 @@ class Heads(eqx.Module):
             )
             return first, [eqx.tree_at(lambda m: m.layers, m, m.layers[1:]) for m in whole]
 
-        self.agent_in, (self.obs, self.agent_reward) = decoders(agent, (obs_dim, 1), keys[:2])
+        sizes = (1,) if obs_dim is None else (obs_dim, 1)
+        self.agent_in, own = decoders(agent, sizes, keys[2 - len(sizes) : 2])
+        self.obs = None if obs_dim is None else own[0]
+        self.agent_reward = own[-1]
         sizes = (1, action_dim + 1, action_dim) + (1,) * both_levels_reward
         self.full_in, rest = decoders(full, sizes, keys[2 : 2 + len(sizes)])
         self.terminated, self.available, self.action = rest[:3]
@@ -96,21 +103,28 @@ class Heads(eqx.Module):
             key_score = jax.random.fold_in(key, 1)
             self.score = MLP(full, 1, hidden, n_hidden, key_score, activation=activation)
 
-    def __call__(self, agent: Features, full: Features) -> Predictions:
-        """Decode one agent's latents: its own level, and all levels."""
+    def __call__(self, agent: Features, full: Features, obs: Any = None) -> Predictions:
+        """Decode one agent's latents: its own level, and all levels.
+
+        `obs` `[O]` is the decoded observation where these heads have no decoder of it.
+        """
 
         def split(first: Linear, seen: Features, n: int) -> list[Float[Array, " D"]]:
             parts = jnp.split(first(*parts_of(seen)), n, axis=-1)
-            return [activate(part, self.obs.activation) for part in parts]
+            return [activate(part, self.agent_reward.activation) for part in parts]
 
-        obs, reward = split(self.agent_in, agent, 2)
+        if self.obs is None:
+            (reward,) = split(self.agent_in, agent, 1)
+        else:
+            hidden, reward = split(self.agent_in, agent, 2)
+            obs = self.obs(hidden)
         terminated, available, action, *both = split(
             self.full_in, full, 4 if self.full_reward else 3
         )
         offered = self.available(available)
         agent_reward = self.agent_reward(reward)[0]
         return Predictions(
-            obs=self.obs(obs),
+            obs=obs,
             reward=self.full_reward(both[0])[0] if self.full_reward else agent_reward,
             agent_reward=agent_reward if self.full_reward else None,
             terminated=self.terminated(terminated)[0],

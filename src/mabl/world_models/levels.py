@@ -9,9 +9,10 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.nets.categorical import Code, CodeShape, draw, still, unflatten
 from mabl.nets.gru import GRU
-from mabl.nets.mlp import MLP, Activation, Features, Linear, Part, Widths, activate
+from mabl.nets.mlp import MLP, Activation, Features, Linear, Part, Widths, activate, parts_of
 from mabl.nets.normaliser import Normaliser
 from mabl.types import PRNGKey
+from mabl.world_models.base import WorldModelConfig
 
 Tree = TypeVar("Tree")
 
@@ -81,6 +82,19 @@ class Categoricals(eqx.Module):
         return unflatten(self.mlp(*inputs), self.n_classes)
 
 
+def policy_decoder(config: WorldModelConfig, obs_dim: int, key: PRNGKey) -> MLP | None:
+    """A decoder of observations for the filter, if policies see what it decodes."""
+    if config.policy_input == "latent":
+        return None
+    seen, n = (config.latent, config.hidden), config.n_hidden
+    return MLP(seen, obs_dim, config.hidden, n, key, activation=config.activation)
+
+
+def with_decoded(features: Features, decoder: MLP | None) -> Features:
+    """(z, h) and, if there is a decoder, the observation decoded from them."""
+    return features if decoder is None else (*parts_of(features), decoder(*parts_of(features)))
+
+
 def team_of(n_agents: int, own: Tree) -> Tree:
     """One agent's arrays, repeated along a new axis of agents."""
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (n_agents, *x.shape)), own)
@@ -130,6 +144,8 @@ class AgentFilter(eqx.Module):
     encoder: MLP
     recurrent: Recurrent
     posterior: Categoricals
+    decoder: MLP | None
+    """The observation's decoder, where policies see what it decodes."""
     scale: Normaliser | None
     """Running mean and variance of observations, by which they are standardised."""
     obs_dim: int = eqx.field(static=True)
@@ -145,7 +161,9 @@ class AgentFilter(eqx.Module):
         key: PRNGKey,
         standardise: bool = False,
         activation: Activation = "relu",
+        decoder: MLP | None = None,
     ):
+        self.decoder = decoder
         self.scale = Normaliser.fresh(obs_dim) if standardise else None
         key_encoder, key_recurrent, key_posterior = jax.random.split(key, 3)
         self.obs_dim, self.latent, self.hidden = obs_dim, latent, hidden
@@ -176,5 +194,6 @@ class AgentFilter(eqx.Module):
         return still(self.infer(level, prev_action, self.embed(obs), key)[0])
 
     def features(self, level: Level) -> Features:
-        """(z_t, h_t): what the policy sees."""
-        return level.features()
+        """What the policy sees: (z_t, h_t), and the observation decoded from them if there is a
+        decoder; one agent's, without further axes."""
+        return with_decoded(level.features(), self.decoder)

@@ -13,7 +13,7 @@ from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.bilevel import BiLevel, Inputs, Latent
 from mabl.world_models.heads import Predictions
-from mabl.world_models.levels import AgentFilter, Level, forget, restored, team_of
+from mabl.world_models.levels import AgentFilter, Level, forget, team_of
 
 
 class MABL(eqx.Module):
@@ -135,16 +135,18 @@ class MABL(eqx.Module):
         o^i_t from (z^a, h^a); r^i_t likewise (`config.reward_input`); termination, availability and
         a^i_{t-1} from both levels.
         """
-        features = self.actor_features(latent), self.critic_features(latent)
-        predicted = jax.vmap(self.nets.heads)(*features)
-        return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
+        return jax.vmap(self.nets.predict)(latent.agent, self._both(latent))
 
     def actor_features(self, latent: Latent) -> Features:
-        """(z^a, h^a): all that a policy may see (section 3.3)."""
-        return latent.agent.features()
+        """(z^a, h^a), and what is decoded from them: all that a policy may see (section 3.3)."""
+        return jax.vmap(self.filter.features)(latent.agent)
 
     def critic_features(self, latent: Latent) -> Features:
-        """(z^a, z^g, h^a, h^g): the centralised critic's input."""
+        """(z^a, z^g, h^a, h^g), and what policies see beside: the centralised critic's input."""
+        return *self._both(latent), *self.actor_features(latent)[2:]
+
+    def _both(self, latent: Latent) -> Features:
+        """(z^a, z^g, h^a, h^g)."""
         return latent.agent.z, latent.global_.z, latent.agent.h, latent.global_.h
 
     def global_features(self, latent: Latent) -> Code:

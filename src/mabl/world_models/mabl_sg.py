@@ -13,7 +13,7 @@ from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.bilevel import BiLevel, Inputs, Latent
 from mabl.world_models.heads import Predictions
-from mabl.world_models.levels import AgentFilter, Level, forget, restored, team_of
+from mabl.world_models.levels import AgentFilter, Level, forget, team_of
 
 
 class MABLSG(eqx.Module):
@@ -98,15 +98,17 @@ class MABLSG(eqx.Module):
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent from its own level and the team's."""
-        features = self.actor_features(latent), self.critic_features(latent)
-        predicted = jax.vmap(self.nets.heads)(*features)
-        return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
+        return jax.vmap(self.nets.predict)(latent.agent, self._both(latent))
 
     def actor_features(self, latent: Latent) -> Features:
-        """(z^a, h^a): all that a policy may see."""
-        return latent.agent.features()
+        """(z^a, h^a), and what is decoded from them: all that a policy may see."""
+        return jax.vmap(self.filter.features)(latent.agent)
 
     def critic_features(self, latent: Latent) -> Features:
+        """Each agent's z^a and h^a beside the team's z^g and h^g, and what policies see beside."""
+        return *self._both(latent), *self.actor_features(latent)[2:]
+
+    def _both(self, latent: Latent) -> Features:
         """Each agent's z^a and h^a beside the team's z^g and h^g."""
         team = team_of(self.spec.n_agents, latent.global_)
         return latent.agent.z, team.z, latent.agent.h, team.h

@@ -18,13 +18,22 @@ from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.attention import TransformerEncoder
 from mabl.nets.categorical import CodeShape, draw, still
 from mabl.nets.gru import GRU
-from mabl.nets.mlp import MLP, Features, Linear, activate
+from mabl.nets.mlp import MLP, Features, Linear, Part, activate
 from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.heads import Heads, Predictions
-from mabl.world_models.levels import Categoricals, Level, forget, restored, standardised, team_of
+from mabl.world_models.levels import (
+    Categoricals,
+    Level,
+    forget,
+    policy_decoder,
+    restored,
+    standardised,
+    team_of,
+    with_decoded,
+)
 
 
 @dataclass(frozen=True)
@@ -86,6 +95,8 @@ class FilterNets(eqx.Module):
     communication: TransformerEncoder
     cell: GRU
     posterior: Categoricals
+    decoder: MLP | None
+    """The observation's decoder, where policies see what it decodes."""
 
     def __init__(
         self,
@@ -104,6 +115,7 @@ class FilterNets(eqx.Module):
         )
         self.cell = GRU(hidden, hidden, keys[3])
         self.posterior = Categoricals((hidden, hidden), hidden, latent, keys[4], activation)
+        self.decoder = policy_decoder(config, spec.obs_dim, jax.random.fold_in(key, 1))
 
     def listen(
         self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey | None
@@ -191,8 +203,10 @@ class JointFilter(eqx.Module):
         return still(self.infer(memory, prev_action, self.embed(obs), alive, key)[0])
 
     def features(self, memory: Latent) -> Features:
-        """(z_t, h_t) of every agent."""
-        return memory.level.features()
+        """What policies see: (z_t, h_t), and the decoded observation if there is a decoder."""
+        return self.team.map(
+            lambda nets, level: with_decoded(level.features(), nets.decoder), memory.level
+        )
 
 
 class DecoderNets(eqx.Module):
@@ -208,7 +222,7 @@ class DecoderNets(eqx.Module):
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, hidden),
-            obs_dim=spec.obs_dim,
+            obs_dim=spec.obs_dim if config.policy_input == "latent" else None,
             action_dim=spec.action_space.size,
             hidden=hidden,
             n_hidden=config.n_hidden,
@@ -289,15 +303,17 @@ class MAMBA(eqx.Module):
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent from its own latent."""
-        predicted = self.decoders.map(
-            lambda nets, features: nets.heads(features, features), latent.level.features()
-        )
+
+        def decode(nets: DecoderNets, seen: tuple[Part, ...]) -> Predictions:
+            return nets.heads(seen[:2], seen[:2], *seen[2:])
+
+        predicted = self.decoders.map(decode, self.filter.features(latent))
         return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
 
     def actor_features(self, latent: Latent) -> Features:
-        """(z, h)."""
-        return latent.level.features()
+        """(z, h), and what else the policy sees."""
+        return self.filter.features(latent)
 
     def critic_features(self, latent: Latent) -> Features:
-        """(z, h): agents have already heard of each other."""
-        return latent.level.features()
+        """What policies see: agents have already heard of each other."""
+        return self.filter.features(latent)
