@@ -45,7 +45,7 @@ PAPER = {
 _QUICK = {
     "smax": Config(
         preset="quick",
-        total_steps=30_000,
+        total_steps=20_000,
         precision="bfloat16",
         training=TrainingConfig(
             num_envs=16,
@@ -56,6 +56,7 @@ _QUICK = {
             pretrain_updates=500,
             replay_capacity=100_000,
             reward_scale=SMAX_REWARD_SCALE,
+            diagnose_every=5_000,
         ),
         world_model=WorldModelConfig(
             hidden=128,
