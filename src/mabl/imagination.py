@@ -33,8 +33,8 @@ class ImaginationConfig:
     n_starts: int | None = None
     """Start states drawn from the posterior states of a batch; None: all, as in the paper."""
     recency: float = 1.0
-    """How much more often than at the average row imagination starts at the newest one; 1: at all
-    rows alike, as in the paper."""
+    """How many times as often as the average sequence of the replay the newest one is drawn, for
+    starts and for the critic's replayed rows; 1: all alike, as in the paper."""
     sample_availability: bool = True
     """Sample the availability of imagined actions, as in the paper, or take its mode."""
     sample_life: bool = False

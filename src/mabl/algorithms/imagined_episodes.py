@@ -22,8 +22,8 @@ class Episode(NamedTuple):
     """Mean over agents, scaled units."""
     length: Float[Array, "*b"]
     """Joint steps."""
-    score: Float[Array, "*b"]
-    """Expected score of the ends; an episode that the limit cuts scores 0."""
+    won: Float[Array, "*b"]
+    """Probability of an end that is a win; an episode that the limit cuts is none."""
 
 
 def imagine_episode(dream: Dream, start: Imagined, limit: int, key: PRNGKey) -> Episode:
@@ -36,17 +36,18 @@ def imagine_episode(dream: Dream, start: Imagined, limit: int, key: PRNGKey) -> 
         key_action, key_step = jax.random.split(key)
         action, _ = dream.act(state, key_action)
         state, predicted = dream.step(state, action, key_step)
-        goes_on = so_far.reached * dream.continues(predicted).mean()
-        score = 0.0 if predicted.score is None else jax.nn.sigmoid(predicted.score).mean()
+        # An episode ends when all agents have ended, and their ends may coincide.
+        goes_on = so_far.reached * dream.continues(predicted).max()
+        wins = 0.0 if predicted.win is None else jax.nn.sigmoid(predicted.win).mean()
         after = Episode(
             reached=goes_on,
             total_reward=so_far.total_reward + so_far.reached * predicted.reward.mean(),
             length=so_far.length + so_far.reached,
-            score=so_far.score + (so_far.reached - goes_on) * score,
+            won=so_far.won + (so_far.reached - goes_on) * wins,
         )
         return (state, after), None
 
-    fresh = Episode(jnp.ones(()), *jnp.zeros((3, 1))[:, 0])
+    fresh = Episode(jnp.ones(()), *jnp.zeros(3))
     return jax.lax.scan(advance, (start, fresh), jax.random.split(key, limit))[0][1]
 
 
@@ -71,11 +72,11 @@ def imagined_episodes(
         start, jax.random.split(key_play, EPISODES)
     )
     told = {
-        "return": played.total_reward / reward_scale,
-        "length": played.length,
-        "score": played.score,
+        "imagined_episode_return": played.total_reward / reward_scale,
+        "imagined_episode_length": played.length,
+        "imagined_win_rate": played.won,
     }
     return {
-        f"behaviour/imagined_episode_{name}": jnp.where(first.any(), value.mean(), jnp.nan)
+        f"behaviour/{name}": jnp.where(first.any(), value.mean(), jnp.nan)
         for name, value in told.items()
     }

@@ -185,8 +185,8 @@ class ModelBased(NamedTuple):
             self.config.training.reward_scale,
             key_play,
         )
-        if not self.spec.score_is_share:
-            del promised["behaviour/imagined_episode_score"]
+        if not self.spec.scores_wins:
+            del promised["behaviour/imagined_win_rate"]
         return metrics | promised
 
     def dream(self, learner: Learner) -> Dream:

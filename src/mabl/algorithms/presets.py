@@ -145,7 +145,7 @@ _QUICK_OWN = replace(
     total_steps=30_000,
     # Behaviour learning is that of before ADR 20, with which all of this was chosen and measured.
     precision="float32",
-    training=replace(_QUICK_SMAC.training, policy_updates=1),
+    training=replace(_QUICK_SMAC.training, policy_updates=1, diagnose_every=10_000),
     world_model=_FINE,
     mappo=replace(
         _QUICK_SMAC.mappo, batch_size=2000, value_decay=0.98, ent_coef=0.03, ent_final=None

@@ -91,9 +91,9 @@ class EnvSpec:
     """Each agent's own number of actions, where they differ; the rest is never available."""
 
     @property
-    def score_is_share(self) -> bool:
-        """Whether scores are from [0, 1]: battles won, or trains that arrived."""
-        return self.score_name in ("win_rate", "arrived")
+    def scores_wins(self) -> bool:
+        """Whether scores are 1 for a win and 0 otherwise, also where a limit cuts the episode."""
+        return self.score_name == "win_rate"
 
 
 @runtime_checkable

@@ -17,7 +17,7 @@ PANELS = {
     "score of training and imagined episodes": (
         "train/win_rate",
         "train/score",
-        "behaviour/imagined_episode_score",
+        "behaviour/imagined_win_rate",
     ),
     "return: real, imagined, and the critic's at resets": (
         "train/episode_return",

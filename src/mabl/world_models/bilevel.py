@@ -88,7 +88,7 @@ class BiLevel(eqx.Module):
             hidden=hidden,
             n_hidden=config.n_hidden,
             both_levels_reward=config.reward_input == "both",
-            scored=spec.score_is_share,
+            wins=spec.scores_wins,
             key=keys[6],
             activation=activation,
         )

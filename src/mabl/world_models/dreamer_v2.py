@@ -66,7 +66,7 @@ class DreamerV2(eqx.Module):
             hidden=hidden,
             n_hidden=config.n_hidden,
             both_levels_reward=False,
-            scored=spec.score_is_share,
+            wins=spec.scores_wins,
             key=keys[2],
             activation=config.activation,
         )

@@ -37,8 +37,8 @@ class Predictions(NamedTuple):
     """Logit of p(alive)."""
     action: Float[Array, "*b A"]
     """The agent's own previous action: logits if discrete, mean if continuous."""
-    score: Float[Array, "*b"] | None = None
-    """Logit of the score with which an episode that ends here ends, where scores are shares."""
+    win: Float[Array, "*b"] | None = None
+    """Logit of p(win | the episode ends here), where scores tell wins."""
 
 
 class Heads(eqx.Module):
@@ -46,7 +46,7 @@ class Heads(eqx.Module):
 
     With `both_levels_reward` a second reward predictor sees both levels; ADR 4 says why. Life comes
     from the decoder of availability, as one Bernoulli more (ADR 9). First layers that see the same
-    are computed as one. With `scored` there is a predictor of the score, for diagnostics alone.
+    are computed as one. With `wins` there is a predictor of wins, for diagnostics alone.
     """
 
     agent_in: Linear
@@ -58,7 +58,7 @@ class Heads(eqx.Module):
     available: MLP
     action: MLP
     full_reward: MLP | None
-    score: MLP | None
+    win: MLP | None
     """A diagnostic: its loss trains nothing before it."""
 
     def __init__(
@@ -72,7 +72,7 @@ class Heads(eqx.Module):
         both_levels_reward: bool,
         key: PRNGKey,
         activation: Activation = "relu",
-        scored: bool = False,
+        wins: bool = False,
     ):
         """`agent` and `full` are the widths of what decoders see: its own level, and all levels.
 
@@ -98,10 +98,10 @@ class Heads(eqx.Module):
         self.full_in, rest = decoders(full, sizes, keys[2 : 2 + len(sizes)])
         self.terminated, self.available, self.action = rest[:3]
         self.full_reward = rest[3] if both_levels_reward else None
-        self.score = None
-        if scored:
-            key_score = jax.random.fold_in(key, 1)
-            self.score = MLP(full, 1, hidden, n_hidden, key_score, activation=activation)
+        self.win = None
+        if wins:
+            key_win = jax.random.fold_in(key, 1)
+            self.win = MLP(full, 1, hidden, n_hidden, key_win, activation=activation)
 
     def __call__(self, agent: Features, full: Features, obs: Any = None) -> Predictions:
         """Decode one agent's latents: its own level, and all levels.
@@ -131,7 +131,7 @@ class Heads(eqx.Module):
             available=offered[:-1],
             alive=offered[-1],
             action=self.action(action),
-            score=None if self.score is None else self.score(*detached(full))[0],
+            win=None if self.win is None else self.win(*detached(full))[0],
         )
 
 

@@ -149,7 +149,7 @@ def decoder_losses(
     -log p(o^i | z^a, h^a), -log p(r^i | z^a, h^a), and -log p(. | z^a, z^g, h^a, h^g) of
     termination, availability and the action a^i_{t-1} (sections 3.1.2 and 3.2), and of life
     (ADR 9). Observations and actions of the dead do not count, nor the action before a first row,
-    nor the score of a row that does not end an episode. Errors of observations are in units of
+    nor wins on rows that do not end an episode. Errors of observations are in units of
     `obs_std`, by feature.
     """
     alive = rows.alive.astype(jnp.float32)
@@ -170,10 +170,11 @@ def decoder_losses(
         "alive": config.end_weight * optax.sigmoid_binary_cross_entropy(predicted.alive, alive),
         "action": acted * action_loss(predicted.action, rows.prev_action, action_space),
     }
-    if predicted.score is not None:
-        ended = is_last(rows)[..., None]
-        score = jnp.broadcast_to(jnp.nan_to_num(rows.score)[..., None], alive.shape)
-        losses["score"] = ended * optax.sigmoid_binary_cross_entropy(predicted.score, score)
+    if predicted.win is not None:
+        # An episode that was cut because its worker was lost has no score.
+        known = (is_last(rows) & jnp.isfinite(rows.score))[..., None]
+        won = jnp.broadcast_to(jnp.nan_to_num(rows.score)[..., None], alive.shape)
+        losses["win"] = known * optax.sigmoid_binary_cross_entropy(predicted.win, won)
     if predicted.agent_reward is not None:
         weight = config.agent_reward_weight * config.reward_weight
         losses["agent_reward"] = weight * reward_loss(

@@ -227,7 +227,7 @@ class DecoderNets(eqx.Module):
             hidden=hidden,
             n_hidden=config.n_hidden,
             both_levels_reward=False,
-            scored=spec.score_is_share,
+            wins=spec.scores_wins,
             key=key_heads,
             activation=config.activation,
         )

@@ -56,7 +56,7 @@ def observe_batch(model: WorldModel, rows: TimeStep, key: PRNGKey, train: bool =
     return Observed(latents, prior_latents, posterior, prior)
 
 
-OUTCOMES = ("reward", "agent_reward", "terminated", "score")
+OUTCOMES = ("reward", "agent_reward", "terminated", "win")
 """Predictions that `WorldModelConfig.outcomes` is about, and their losses."""
 
 

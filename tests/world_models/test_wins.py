@@ -1,4 +1,4 @@
-"""The predictor of the score learns from ends alone, and its loss trains nothing else."""
+"""The predictor of wins learns from ends alone, and its loss trains nothing else."""
 
 from dataclasses import replace
 
@@ -17,13 +17,13 @@ SCORED = replace(SPEC, score_name="win_rate")
 
 
 def rows_with_ends():
-    """Row 2 ends an episode with score 1, row 5 is cut with score 0; row 3 is a reset."""
-    rows = some_rows(6, first=(0, 3))
+    """Row 2 is a win, row 5 is cut by the limit, and row 7 because a worker was lost."""
+    rows = some_rows(8, first=(0, 3, 6))
     nan = jnp.nan
     return rows._replace(
         terminated=rows.terminated.at[2].set(True),
-        truncated=rows.truncated.at[5].set(True),
-        score=jnp.array([nan, nan, 1.0, nan, nan, 0.0]),
+        truncated=rows.truncated.at[jnp.array([5, 7])].set(True),
+        score=jnp.array([nan, nan, 1.0, nan, nan, 0.0, nan, nan]),
     )
 
 
@@ -38,12 +38,12 @@ def test_it_learns_from_ends_and_trains_nothing_before_it(make, outcomes):
     def told(model):
         latents = observe_batch(model, rows, jax.random.key(1)).latents
         predicted = predict_sequence(model, latents, config)
-        loss = decoder_losses(predicted, rows, config, SCORED.action_space)["score"]
-        return loss.sum(), (loss, predicted.score)
+        loss = decoder_losses(predicted, rows, config, SCORED.action_space)["win"]
+        return loss.sum(), (loss, predicted.win)
 
     gradient, (loss, logit) = jax.device_get(eqx.filter_grad(told, has_aux=True)(model))
     logit = logit[:, 0]
-    expected = np.zeros((6, 3))
+    expected = np.zeros((8, 3))
     expected[2], expected[5] = np.log1p(np.exp(-logit[2])), np.log1p(np.exp(logit[5]))
     np.testing.assert_allclose(loss[:, 0], expected, rtol=1e-5)
     trained = {
@@ -51,14 +51,14 @@ def test_it_learns_from_ends_and_trains_nothing_before_it(make, outcomes):
         for path, leaf in jax.tree_util.tree_leaves_with_path(gradient)
         if np.abs(leaf).max() > 0
     }
-    assert trained and all(".heads.score." in name for name in trained)
+    assert trained and all(".heads.win." in name for name in trained)
 
 
 @pytest.mark.parametrize("make", MODELS)
-def test_scores_that_are_no_shares_are_not_predicted(make):
+def test_other_scores_are_not_predicted(make):
     model = make(SPEC, CONFIG, jax.random.key(0))
     rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batched(some_rows(3)))
     latents = observe_batch(model, rows, jax.random.key(1)).latents
     predicted = predict_sequence(model, latents, CONFIG)
-    assert predicted.score is None
-    assert "score" not in decoder_losses(predicted, rows, CONFIG, SPEC.action_space)
+    assert predicted.win is None
+    assert "win" not in decoder_losses(predicted, rows, CONFIG, SPEC.action_space)
