@@ -190,7 +190,7 @@ class Oracle(NamedTuple):
         return after, model_metrics | policy_metrics | ended
 
     def diagnose(self, state: TrainState) -> Metrics:
-        """What `mabl train` tells of the world model now and then."""
+        """Compute the world model's diagnostics, as `mabl train` does."""
         rows = state.replay._replace(rows=state.replay.rows.row)
         return self.algorithm.diagnose(state.learner, rows, jax.random.fold_in(state.key, 1))
 
@@ -378,7 +378,7 @@ def told(metrics: dict[str, float], sums: dict[str, float], score: str) -> dict[
 
 
 def said(metrics: Metrics) -> dict[str, float]:
-    """Finite values, under the last part of their names."""
+    """Keep finite values, rounded, under the last part of their names."""
     finite = {k.rpartition("/")[2]: float(v) for k, v in metrics.items() if math.isfinite(v)}
     return {k: round(v, 4) for k, v in finite.items()}
 

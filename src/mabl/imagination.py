@@ -33,8 +33,8 @@ class ImaginationConfig:
     n_starts: int | None = None
     """Start states drawn from the posterior states of a batch; None: all, as in the paper."""
     recency: float = 1.0
-    """How many times as often as the average sequence of the replay the newest one is drawn, for
-    starts and for the critic's replayed rows; 1: all alike, as in the paper."""
+    """Weight of the newest replayed sequence relative to the average one, for starts and for the
+    critic's replayed rows; 1 draws all alike, as in the paper."""
     sample_availability: bool = True
     """Sample the availability of imagined actions, as in the paper, or take its mode."""
     sample_life: bool = False
@@ -95,7 +95,7 @@ class Dream(NamedTuple):
         drawn = jax.random.uniform(key_alive, state.alive.shape) if self.config.sample_life else 0.5
         alive = state.alive & (jax.nn.sigmoid(predicted.alive) > drawn)
         with_life = getattr(self.model, "with_life", None)
-        if with_life is not None:  # who lives is part of the model's latent
+        if with_life is not None:  # the latent also tells who is alive
             latent = with_life(latent, alive)
         return Imagined(latent, available, alive), predicted
 

@@ -1,4 +1,4 @@
-"""Policies that see the decoded observation: what it is, who trains it, and whom it depends on."""
+"""Policy inputs with the decoded observation: values, gradients and dependence on teammates."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from tests.world_models.test_mabl import SPEC, batched, some_rows
-from tests.world_models.test_scales import MODELS, SCALED, rows_in
+from tests.world_models.test_scales import MODELS, SCALED, SHIFTS, SIZES, rows_in
 
 from mabl.world_models.dreamer_v2 import DreamerV2
 from mabl.world_models.loss import model_loss
@@ -19,7 +19,6 @@ from mabl.world_models.mamba import MAMBA
 from mabl.world_models.sequences import observe_sequence, with_scales
 
 DECODED = replace(SCALED, policy_input="decoded")
-SIZES, SHIFTS = np.array([1.0, 10.0, 100.0, 0.5]), np.array([0.0, 5.0, -300.0, 1.0])
 
 
 def latents_of(model, rows):

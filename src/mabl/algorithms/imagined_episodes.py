@@ -1,4 +1,4 @@
-"""Whole episodes in imagination: what the model promises the policy, to compare with real ones."""
+"""Diagnostic of the world model: whole imagined episodes, to compare with real ones."""
 
 from typing import NamedTuple
 
@@ -59,7 +59,7 @@ def imagined_episodes(
     reward_scale: float,
     key: PRNGKey,
 ) -> Metrics:
-    """Means over imagined episodes, in the environment's units.
+    """Mean return, length and win rate of imagined episodes, in the environment's units.
 
     They start from `states` `[*b, ...]` that begin an episode, drawn with replacement; all values
     are NaN if none does.
@@ -71,12 +71,12 @@ def imagined_episodes(
     played = jax.vmap(lambda start, key: imagine_episode(dream, start, limit, key))(
         start, jax.random.split(key_play, EPISODES)
     )
-    told = {
+    values = {
         "imagined_episode_return": played.total_reward / reward_scale,
         "imagined_episode_length": played.length,
         "imagined_win_rate": played.won,
     }
     return {
         f"behaviour/{name}": jnp.where(first.any(), value.mean(), jnp.nan)
-        for name, value in told.items()
+        for name, value in values.items()
     }

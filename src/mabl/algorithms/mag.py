@@ -155,7 +155,7 @@ class MAG(NamedTuple):
         return learner._replace(base=base), metrics
 
     def diagnose(self, learner: LookaheadLearner, replay: Replay, key: PRNGKey) -> Metrics:
-        """How well the world model predicts sequences of the replay."""
+        """Compute the diagnostics of `ModelBased.diagnose`."""
         return self.base.diagnose(learner.base, replay, key)
 
 

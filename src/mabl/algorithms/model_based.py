@@ -152,7 +152,7 @@ class ModelBased(NamedTuple):
         return learner._replace(behaviour=behaviour), metrics
 
     def diagnose(self, learner: Learner, replay: Replay, key: PRNGKey) -> Metrics:
-        """How well the world model predicts sequences of the replay, and what it promises.
+        """Compute diagnostics of the world model on sequences of the replay and imagined episodes.
 
         Values at resets and imagined episodes are in the environment's units, to compare with the
         episodes of training.
@@ -177,7 +177,7 @@ class ModelBased(NamedTuple):
             masked_mean(jax.vmap(jax.vmap(value))(latents, rows), rows.is_first)
             / self.config.training.reward_scale
         )
-        promised = imagined_episodes(
+        imagined = imagined_episodes(
             self.dream(learner),
             Imagined(latents, rows.available, rows.alive),
             rows.is_first,
@@ -186,8 +186,8 @@ class ModelBased(NamedTuple):
             key_play,
         )
         if not self.spec.scores_wins:
-            del promised["behaviour/imagined_win_rate"]
-        return metrics | promised
+            del imagined["behaviour/imagined_win_rate"]
+        return metrics | imagined
 
     def dream(self, learner: Learner) -> Dream:
         """The learner's model and policy, ready to imagine."""

@@ -40,8 +40,8 @@ class WorldModelConfig:
     """Standardise observations and states by their running mean and variance, for encoders and for
     the observations' loss."""
     policy_input: Literal["latent", "decoded"] = "latent"
-    """What policies (and MAPPO's critics) see: the latent (z, h) as in the paper, or also the
-    observation decoded from it, which means the same while codes change as the model learns."""
+    """Input of policies and of MAPPO's critics: the latent (z, h) as in the paper, or also the
+    observation decoded from it."""
     obs_weight: float = 1.0
     """Weight of the observations' loss."""
     outcomes: Literal["row", "transition"] = "row"
@@ -80,8 +80,8 @@ class WorldModelConfig:
     batch_size: int = 40
     """Sequences in a model update."""
     recency: float = 1.0
-    """How many times as often as the average sequence of the replay the newest one is drawn; 1: all
-    alike, as in the paper."""
+    """Weight of the newest replayed sequence relative to the average one, in model updates; 1 draws
+    all alike, as in the paper."""
     batch_length: int = 20
     """Rows of a sequence, 2 at least."""
 

@@ -18,7 +18,6 @@ from mabl.world_models.levels import (
     Categoricals,
     Level,
     Recurrent,
-    policy_decoder,
     restored,
     standardised,
 )
@@ -58,16 +57,7 @@ class BiLevel(eqx.Module):
         keys = jax.random.split(key, 7)
         hidden, latent = config.hidden, config.latent
         action_dim = spec.action_space.size
-        self.filter = AgentFilter(
-            spec.obs_dim,
-            action_dim,
-            hidden,
-            latent,
-            keys[0],
-            config.standardise,
-            config.activation,
-            policy_decoder(config, spec.obs_dim, jax.random.fold_in(keys[0], 1)),
-        )
+        self.filter = AgentFilter.of(spec, config, keys[0])
         self.state_scale = Normaliser.fresh(spec.state_dim) if config.standardise else None
         activation = config.activation
         self.state_encoder = MLP(spec.state_dim, hidden, hidden, 2, keys[1], activation=activation)

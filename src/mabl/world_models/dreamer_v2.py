@@ -18,7 +18,6 @@ from mabl.world_models.levels import (
     Categoricals,
     Level,
     forget,
-    policy_decoder,
     restored,
     team_of,
 )
@@ -47,16 +46,7 @@ class DreamerV2(eqx.Module):
         keys = jax.random.split(key, 3)
         hidden, latent = config.hidden, config.latent
         self.spec = spec
-        self.filter = AgentFilter(
-            spec.obs_dim,
-            spec.action_space.size,
-            hidden,
-            latent,
-            keys[0],
-            config.standardise,
-            config.activation,
-            policy_decoder(config, spec.obs_dim, jax.random.fold_in(keys[0], 1)),
-        )
+        self.filter = AgentFilter.of(spec, config, keys[0])
         self.agent_prior = Categoricals((hidden,), hidden, latent, keys[1], config.activation)
         self.heads = Heads(
             agent=(latent, hidden),
@@ -110,9 +100,9 @@ class DreamerV2(eqx.Module):
         return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
 
     def actor_features(self, latent: Level) -> Features:
-        """(z, h), and what else the policy sees."""
+        """Policy inputs: (z, h), and the decoded observation if there is a decoder."""
         return jax.vmap(self.filter.features)(latent)
 
     def critic_features(self, latent: Level) -> Features:
-        """What policies see: there is nothing else."""
+        """The policy inputs: there is no other level."""
         return self.actor_features(latent)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mabl.envs.base import EnvSpec
 from mabl.nets.categorical import Code, CodeShape, draw, still, unflatten
 from mabl.nets.gru import GRU
 from mabl.nets.mlp import MLP, Activation, Features, Linear, Part, Widths, activate, parts_of
@@ -83,7 +84,7 @@ class Categoricals(eqx.Module):
 
 
 def policy_decoder(config: WorldModelConfig, obs_dim: int, key: PRNGKey) -> MLP | None:
-    """A decoder of observations for the filter, if policies see what it decodes."""
+    """Decoder of observations for the filter, or None if policies see the latent alone."""
     if config.policy_input == "latent":
         return None
     seen, n = (config.latent, config.hidden), config.n_hidden
@@ -171,6 +172,20 @@ class AgentFilter(eqx.Module):
         self.recurrent = Recurrent(latent, action_dim, hidden, key_recurrent, activation)
         self.posterior = Categoricals((hidden, hidden), hidden, latent, key_posterior, activation)
 
+    @classmethod
+    def of(cls, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey) -> "AgentFilter":
+        """The filter of an environment's agents, as `config` sizes it."""
+        return cls(
+            spec.obs_dim,
+            spec.action_space.size,
+            config.hidden,
+            config.latent,
+            key,
+            config.standardise,
+            config.activation,
+            policy_decoder(config, spec.obs_dim, jax.random.fold_in(key, 1)),
+        )
+
     def initial(self) -> Level:
         """The latent before an episode's first row: zeros."""
         return still(Level.none(self.hidden, self.latent))
@@ -194,6 +209,6 @@ class AgentFilter(eqx.Module):
         return still(self.infer(level, prev_action, self.embed(obs), key)[0])
 
     def features(self, level: Level) -> Features:
-        """What the policy sees: (z_t, h_t), and the observation decoded from them if there is a
-        decoder; one agent's, without further axes."""
+        """Input of one agent's policy: (z_t, h_t), and the decoded observation if there is a
+        decoder."""
         return with_decoded(level.features(), self.decoder)

@@ -138,11 +138,11 @@ class MABL(eqx.Module):
         return jax.vmap(self.nets.predict)(latent.agent, self._both(latent))
 
     def actor_features(self, latent: Latent) -> Features:
-        """(z^a, h^a), and what is decoded from them: all that a policy may see (section 3.3)."""
+        """Policy inputs: (z^a, h^a) (section 3.3), and the decoded observation, if any."""
         return jax.vmap(self.filter.features)(latent.agent)
 
     def critic_features(self, latent: Latent) -> Features:
-        """(z^a, z^g, h^a, h^g), and what policies see beside: the centralised critic's input."""
+        """Critic inputs: (z^a, z^g, h^a, h^g), and the decoded observation, if any."""
         return *self._both(latent), *self.actor_features(latent)[2:]
 
     def _both(self, latent: Latent) -> Features:

@@ -101,11 +101,11 @@ class MABLSG(eqx.Module):
         return jax.vmap(self.nets.predict)(latent.agent, self._both(latent))
 
     def actor_features(self, latent: Latent) -> Features:
-        """(z^a, h^a), and what is decoded from them: all that a policy may see."""
+        """Policy inputs: (z^a, h^a), and the decoded observation if there is a decoder."""
         return jax.vmap(self.filter.features)(latent.agent)
 
     def critic_features(self, latent: Latent) -> Features:
-        """Each agent's z^a and h^a beside the team's z^g and h^g, and what policies see beside."""
+        """Critic inputs: both levels, and the decoded observation if there is a decoder."""
         return *self._both(latent), *self.actor_features(latent)[2:]
 
     def _both(self, latent: Latent) -> Features:

@@ -203,7 +203,7 @@ class JointFilter(eqx.Module):
         return still(self.infer(memory, prev_action, self.embed(obs), alive, key)[0])
 
     def features(self, memory: Latent) -> Features:
-        """What policies see: (z_t, h_t), and the decoded observation if there is a decoder."""
+        """Policy inputs: (z_t, h_t), and the decoded observation if there is a decoder."""
         return self.team.map(
             lambda nets, level: with_decoded(level.features(), nets.decoder), memory.level
         )
@@ -292,7 +292,7 @@ class MAMBA(eqx.Module):
         return Latent(level, latent.alive), {"agent": logits}
 
     def imagine(self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey) -> Latent:
-        """Prior latents of the next row; who is likelier dead than alive is not heard after it."""
+        """Prior latents of the next row; agents likelier dead than alive are not heard after it."""
         h = self.filter.recur(latent, action)
         after = still(self.prior(Latent(Level(h, latent.level.z), latent.alive), key)[0])
         return after._replace(alive=latent.alive & (self.predict(after).alive > 0))
@@ -311,9 +311,9 @@ class MAMBA(eqx.Module):
         return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
 
     def actor_features(self, latent: Latent) -> Features:
-        """(z, h), and what else the policy sees."""
+        """Policy inputs: (z, h), and the decoded observation if there is a decoder."""
         return self.filter.features(latent)
 
     def critic_features(self, latent: Latent) -> Features:
-        """What policies see: agents have already heard of each other."""
+        """The policy inputs: they already hold what teammates said."""
         return self.filter.features(latent)
