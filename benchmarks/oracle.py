@@ -44,7 +44,7 @@ from mabl.rollout import Collector, Episodes, advance, start
 from mabl.rows import TimeStep, is_last
 from mabl.runs import folder
 from mabl.runs.checkpoint import Checkpoints
-from mabl.training.loop import TrainState, repeat
+from mabl.training.loop import TrainState, repeat, with_recalled_memories
 from mabl.training.programs import as_in_a_run, build
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 from mabl.world_models.sequences import observe_sequence
@@ -182,6 +182,9 @@ class Oracle(NamedTuple):
             return self.algorithm.learn(learner, *imagined, key_learn, progress)
 
         learner, policy_metrics = repeat(update_policy, learner, key_policy, n_policy)
+        collectors = with_recalled_memories(
+            self.algorithm, self.executor(learner), rows, collectors, jax.random.fold_in(key, 1)
+        )
         steps = (~recorded.row.is_first).sum(dtype=jnp.int32)
         after = TrainState(
             learner, replay, collectors, key, state.env_steps + steps, state.model_updates + n_model

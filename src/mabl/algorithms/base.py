@@ -56,6 +56,12 @@ class Algorithm(Protocol):
         """Replayed joint rows that a model update trains on; 0 without a model."""
         ...
 
+    @property
+    def memory_rows(self) -> int:
+        """Rows from which memories of agents in mid-episode are computed anew after a cycle's
+        updates; 0 where they are carried over."""
+        ...
+
     def init(self, key: PRNGKey) -> Any:
         """A fresh learner."""
         ...

@@ -68,6 +68,11 @@ class MAG(NamedTuple):
         """Rows of a batch; those that the error predictor learns from are not counted."""
         return self.base.model_rows
 
+    @property
+    def memory_rows(self) -> int:
+        """A sequence of the model's."""
+        return self.base.memory_rows
+
     def init(self, key: PRNGKey) -> LookaheadLearner:
         """Fresh parameters and optimisers."""
         config = self.config.lookahead

@@ -70,6 +70,11 @@ class ModelBased(NamedTuple):
         """Rows of a batch of sequences."""
         return self.config.world_model.batch_size * self.config.world_model.batch_length
 
+    @property
+    def memory_rows(self) -> int:
+        """A sequence of the model's."""
+        return self.config.world_model.batch_length
+
     def init(self, key: PRNGKey) -> Learner:
         """Fresh parameters and optimisers."""
         key_model, key_behaviour = jax.random.split(key)

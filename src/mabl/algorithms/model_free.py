@@ -96,6 +96,11 @@ class ModelFree:
         """None: there is no model."""
         return 0
 
+    @property
+    def memory_rows(self) -> int:
+        """None: what is collected is learned from with the memories that it was collected with."""
+        return 0
+
     def init(self, key: PRNGKey) -> PolicyLearner:
         """Fresh parameters and optimisers."""
         config, spec = self.config.recurrent_mappo, self.spec

@@ -68,6 +68,11 @@ class RecurrentQMIX:
         """None: there is no model."""
         return 0
 
+    @property
+    def memory_rows(self) -> int:
+        """A sequence that it learns from."""
+        return self.config.recurrent_qmix.batch_length
+
     def init(self, key: PRNGKey) -> QLearner:
         """Fresh networks, targets that are their copies, and an optimiser."""
         config = self.config.recurrent_qmix

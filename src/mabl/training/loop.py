@@ -11,11 +11,12 @@ from mabl import replay as replays
 from mabl.algorithms.base import Algorithm, Experience
 from mabl.envs.base import CompiledEnv
 from mabl.envs.host import Hosted
-from mabl.execution import Executor, executor_of
+from mabl.execution import Executor, Memory, executor_of
 from mabl.host_rollout import start_hosted
 from mabl.nets.optimiser import guards
 from mabl.replay import Replay
 from mabl.rollout import Collector, Rollout, rollout, start
+from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey
 
 
@@ -117,7 +118,13 @@ class Training(NamedTuple):
         state = TrainState(
             learner=learner,
             replay=replay,
-            collectors=collectors,
+            collectors=with_recalled_memories(
+                self.algorithm,
+                self.executor(learner),
+                replay,
+                collectors,
+                jax.random.fold_in(key, 1),
+            ),
             key=key,
             env_steps=state.env_steps + steps_in(collected),
             model_updates=state.model_updates + n_model,
@@ -155,6 +162,45 @@ class Training(NamedTuple):
     def store(self, replay: Replay, collected: Rollout) -> Replay:
         """Line 4: append the new rows."""
         return jax.vmap(replays.add)(replay, collected.rows, collected.count)
+
+
+def with_recalled_memories(
+    algorithm: Algorithm, executor: Executor, replay: Replay, collectors: Collector, key: PRNGKey
+) -> Collector:
+    """Compute the memories of agents in mid-episode anew, with an executor's parameters.
+
+    A memory holds latents of the parameters that computed it, which mean something else to those
+    that go on with the episode. Where a cycle ends with an episode, nothing is to be done.
+    """
+    config, length = algorithm.config.training, algorithm.memory_rows
+    if config.collect_steps is None or not length:
+        return collectors
+    memory = jax.vmap(lambda *lane: recalled_memory(executor, length, *lane))(
+        replay, collectors.row, jax.random.split(key, config.num_envs)
+    )
+    return collectors._replace(memory=memory)
+
+
+def recalled_memory(
+    executor: Executor, length: int, replay: Replay, newest: TimeStep, key: PRNGKey
+) -> Memory:
+    """Memory of an executor after the last `length` rows of one lane before its newest row.
+
+    The newest row, which gives shapes, has yet to be acted on. Rows that the lane does not hold are
+    as if they had never been.
+    """
+    age = jnp.arange(length, 0, -1)
+    index = (replay.cursor - 1 - age) % replay.rows.is_first.shape[0]
+    rows = jax.tree.map(lambda x: x[index], replay.rows)
+    initial = executor.initial(newest)
+
+    def step(memory: Memory, at: tuple[TimeStep, Array, PRNGKey]) -> tuple[Memory, None]:
+        row, known, key = at
+        after, _ = executor.act(memory, row, key)
+        return jax.tree.map(lambda a, b: jnp.where(known, a, b), after, initial), None
+
+    known = age < replay.size
+    return jax.lax.scan(step, initial, (rows, known, jax.random.split(key, length)))[0]
 
 
 def steps_in(collected: Rollout) -> Int[Array, ""]:
