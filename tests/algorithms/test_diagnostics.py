@@ -4,7 +4,13 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from mabl.algorithms.diagnostics import diagnose, masked_mean, open_loop_error, unexplained
+from mabl.algorithms.diagnostics import (
+    diagnose,
+    masked_mean,
+    open_loop_error,
+    unexplained,
+    value_metrics,
+)
 from mabl.envs.base import Discrete, EnvSpec
 from mabl.envs.counting import CountingEnv
 from mabl.rows import TimeStep
@@ -76,6 +82,35 @@ def test_the_dead_do_not_count_in_what_is_said_of_observations():
     for name in names:
         assert told(rows._replace(obs=dead))[name] == before[name], name
         assert told(rows._replace(obs=living))[name] != before[name], name
+
+
+class Adding:
+    """A model whose latent is a number, to which imagination adds 10 and the team's actions."""
+
+    def imagine(self, latent, action, key):
+        return latent + 10 + (action @ jnp.arange(3.0)).sum()
+
+
+def test_the_value_gap_is_that_of_the_prior_over_the_posterior_of_the_same_row_by_hand():
+    """Posterior latents are 0, 3, 4, 6, 20, 21; rows 1 and 3 are played 1 and 2, others 0."""
+    _, row = CountingEnv().reset(jax.random.key(0))
+    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, 6, *x.shape)), row)
+    played = jnp.zeros((1, 6, 2), jnp.int32).at[0, 1, 0].set(1).at[0, 3, 1].set(2)
+    rows = rows._replace(
+        prev_action=played,
+        is_first=jnp.array([[True, False, False, False, True, False]]),
+        truncated=jnp.array([[False, False, False, True, False, False]]),
+    )
+    latents = jnp.array([[0.0, 3.0, 4.0, 6.0, 20.0, 21.0]])
+
+    def value(latent, row):
+        return 2 * latent
+
+    told = value_metrics(Adding(), value, latents, rows, jax.random.key(0), Discrete(3), 4.0)
+    assert told["behaviour/value_at_reset"] == pytest.approx((2 * 0 + 2 * 20) / 2 / 4)
+    # Rows 1, 2 and 5: row 3 ends an episode, row 4 is a reset.
+    gaps = 2 * ((0 + 10 + 1) - 3), 2 * ((3 + 10) - 4), 2 * ((20 + 10) - 21)
+    assert told["behaviour/value_gap"] == pytest.approx(sum(gaps) / 3 / 4)
 
 
 def test_masked_mean():

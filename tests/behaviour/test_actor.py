@@ -114,7 +114,8 @@ def test_ppo_moves_the_mean_towards_what_paid():
         )
         old = jax.lax.stop_gradient(policy.log_prob(action))
         advantage = jnp.array([-1.0, -1.0, 1.0, 1.0])[:, None]
-        rows = PPORows(view, action, old, advantage, jnp.zeros((4, 1)), jnp.ones((4, 1)))
+        ones = jnp.ones((4, 1))
+        rows = PPORows(view, action, old, advantage, jnp.zeros((4, 1)), ones, ones)
         return policy_loss(policy, rows, jnp.float32(0), 0.2)[0]
 
     gradient = jax.grad(loss)(jnp.zeros((4, 1, 1)))

@@ -190,7 +190,7 @@ def test_replayed_values_by_hand(end, targets):
     replayed = Replayed(some_view(4, 2)._replace(critic_features=features, alive=alive), rows)
     real = mappo.replayed_values(RowCritic(), replayed, BY_HAND)
     assert_allclose(real.target, [[target] * 2 for target in targets])
-    assert_array_equal(real.weight, [[1, 1], [1, 1], [end is None] * 2])
+    assert_array_equal(real.value_weight, [[1, 1], [1, 1], [end is None] * 2])
     assert_array_equal(real.view.critic_features[:, 0, 0], [0, 1, 2])
     assert_array_equal(real.view.alive, [[True, True], [True, True], [True, False]])
     alone = mappo.replayed_values(RowCritic(), replayed, replace(BY_HAND, team_reward=False))
@@ -247,7 +247,8 @@ def test_a_start_of_weight_zero_never_counts():
 
 def test_losses_count_rows_by_their_weight(fresh):
     rows, _ = experience(BY_HAND, random_trajectory(3, 4))
-    rows = rows._replace(weight=jnp.zeros_like(rows.weight).at[5, 1].set(0.3))
+    only = jnp.zeros_like(rows.weight).at[5, 1].set(0.3)
+    rows = rows._replace(weight=only, value_weight=only)
     value = float(fresh.critic(rows.view.critic_features[5])[1])
     loss, _ = mappo.critic_loss(fresh.critic, rows, 0.5)
     assert_allclose(loss, 0.5 * (value - float(rows.target[5, 1])) ** 2, rtol=1e-5)
@@ -363,8 +364,39 @@ def test_replayed_rows_teach_the_critic_by_their_weight_and_never_the_actor(fres
     as_good_as_same(plain.critic, deaf.critic)
     assert (value(taught) > value(plain)).all()
     assert metrics["behaviour/replay_critic_loss"] > 10  # 0.5 (9 - about 0)^2, falling
-    nothing = real._replace(weight=jnp.zeros((6, 2)))
+    nothing = real._replace(value_weight=jnp.zeros((6, 2)))
     as_good_as_same(plain.critic, updated(1.0, nothing)[0].critic)
+
+
+@pytest.mark.parametrize("critic_rows", ["all", "starts"])
+def test_imagined_rows_past_the_start_teach_the_critic_only_if_they_are_to(fresh, critic_rows):
+    """They teach the policy in both cases."""
+    config = replace(TINY, critic_rows=critic_rows)
+    rows, _ = mappo.experience(fresh.value, random_trajectory(4, 6), config)
+    past = jnp.arange(rows.target.shape[0]) >= 6  # rows are flattened horizon first
+    moved = rows._replace(target=jnp.where(past[:, None], rows.target + 5.0, rows.target))
+    critic_grads, actor_grads = zip(
+        *(
+            (
+                eqx.filter_grad(mappo.critic_loss, has_aux=True)(fresh.critic, some, 0.5)[0],
+                eqx.filter_grad(mappo.actor_loss, has_aux=True)(
+                    fresh.actor, some, jnp.float32(0.1), 0.2
+                )[0],
+            )
+            for some in (rows, moved)
+        ),
+        strict=True,
+    )
+    assert same(*critic_grads) == (critic_rows == "starts")
+    starts = jax.tree.map(lambda x: x[:6], rows)
+    if critic_rows == "starts":
+        alone = eqx.filter_grad(mappo.critic_loss, has_aux=True)(fresh.critic, starts, 0.5)[0]
+        jax.tree.map(lambda x, y: assert_allclose(x, y, atol=1e-6), alone, critic_grads[0])
+    quiet = rows._replace(weight=jnp.where(past[:, None], 0.0, rows.weight))
+    quiet_grad = eqx.filter_grad(mappo.actor_loss, has_aux=True)(
+        fresh.actor, quiet, jnp.float32(0.1), 0.2
+    )[0]
+    assert not same(quiet_grad, actor_grads[0])
 
 
 @pytest.mark.parametrize(("value_decay", "learned"), [(0.9, True), (1.0, False)])

@@ -387,7 +387,7 @@ def test_the_critics_loss_by_hand():
     target = jnp.array([[[4.0, 4.0], [2.0, 6.0], [30.0, -1e3]]])
     weight = jnp.array([[[1.0, 1.0], [2.0, 1.0], [1.0, 0.0]]])
     unused = jnp.zeros((1, 3, 2))
-    rows = PPORows(view, unused, unused, unused, target, weight)
+    rows = PPORows(view, unused, unused, unused, target, weight, weight)
     # Normalised targets 1, 1; 0, 2; 14: errors 0, 0; 1, -1; -13. Half the squares 0, 0; 0.5, 0.5;
     # the last is beyond 10: 10 (13 - 5) = 80. 0.5 (2 * 0.5 + 0.5 + 80) / 6 = 6.791667
     loss, metrics = jax.jit(

@@ -54,7 +54,7 @@ def rows_of(available, alive, log_prob, action):
     """One joint row of two agents with three actions."""
     view = TeamView(jnp.zeros((1, 2, 1)), jnp.zeros((1, 2, 1)), available[None], alive[None])
     ones = jnp.ones((1, 2))
-    return PPORows(view, action[None], log_prob[None], ones, ones, ones)
+    return PPORows(view, action[None], log_prob[None], ones, ones, ones, ones)
 
 
 AVAILABLE = jnp.array([[True, True, False], [True, True, True]])

@@ -1,5 +1,6 @@
-"""How good the world model is, in numbers a user can act on (logged as `world_model/...`)."""
+"""How good the world model is, in numbers a user can act on."""
 
+from collections.abc import Callable
 from typing import TypeVar
 
 import jax
@@ -9,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import ActionSpace
 from mabl.nets.categorical import still
-from mabl.rows import TimeStep
+from mabl.rows import TimeStep, is_last
 from mabl.types import Metrics, PRNGKey
 from mabl.world_models.base import WorldModel, WorldModelConfig
 from mabl.world_models.heads import Predictions
@@ -71,6 +72,38 @@ def diagnose(
         )
     metrics["world_model/reward_unexplained_prior"] = metrics["world_model/open_loop_reward_1"]
     return metrics
+
+
+def value_metrics(
+    model: WorldModel[L],
+    value: Callable[[L, TimeStep], Float[Array, ""]],
+    latents: L,
+    rows: TimeStep,
+    key: PRNGKey,
+    action_space: ActionSpace,
+    reward_scale: float,
+) -> Metrics:
+    """Values of posterior latents `[B, T]` at resets, and how much higher imagined ones are valued.
+
+    `behaviour/value_gap` is the mean of V(prior latent) - V(posterior latent) of the same row, the
+    prior's drawn one step ahead with the real action. Above 0, the critic promises more of
+    imagination than of the world. Both metrics are in the environment's units.
+    """
+
+    def ahead(latent: L, row: TimeStep, key: PRNGKey) -> Float[Array, ""]:
+        return value(model.imagine(latent, action_space.encode(row.prev_action), key), row)
+
+    values = jax.vmap(jax.vmap(value))(latents, rows)
+    before, after = (
+        jax.tree.map(lambda x: x[:, :-1], latents),
+        jax.tree.map(lambda x: x[:, 1:], rows),
+    )
+    keys = jax.random.split(key, after.is_first.shape)
+    gap = jax.vmap(jax.vmap(ahead))(before, after, keys) - values[:, 1:]
+    return {
+        "behaviour/value_at_reset": masked_mean(values, rows.is_first) / reward_scale,
+        "behaviour/value_gap": masked_mean(gap, ~after.is_first & ~is_last(after)) / reward_scale,
+    }
 
 
 def swapped(tree: T) -> T:

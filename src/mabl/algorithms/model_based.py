@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
-from mabl.algorithms.diagnostics import DIAGNOSED_ROWS, diagnose, masked_mean
+from mabl.algorithms.diagnostics import DIAGNOSED_ROWS, diagnose, value_metrics
 from mabl.algorithms.imagined_episodes import imagined_episodes
 from mabl.behaviour.base import Behaviour
 from mabl.devices import spread
@@ -163,6 +163,7 @@ class ModelBased(NamedTuple):
         episodes of training.
         """
         key_sample, key_observe, key_diagnose, key_play = jax.random.split(key, 4)
+        key_value = jax.random.fold_in(key_play, 1)
         rows = sample_sequences(replay, key_sample, N_DIAGNOSED, DIAGNOSED_ROWS)
         latents = self._observe(learner, rows, key_observe)
         metrics = diagnose(
@@ -178,16 +179,16 @@ class ModelBased(NamedTuple):
             view = self.view(learner.model, latent, row.available, row.alive)
             return self.behaviour.value(learner.behaviour, view).mean()
 
-        metrics["behaviour/value_at_reset"] = (
-            masked_mean(jax.vmap(jax.vmap(value))(latents, rows), rows.is_first)
-            / self.config.training.reward_scale
+        scale = self.config.training.reward_scale
+        metrics |= value_metrics(
+            learner.model, value, latents, rows, key_value, self.spec.action_space, scale
         )
         imagined = imagined_episodes(
             self.dream(learner),
             Imagined(latents, rows.available, rows.alive),
             rows.is_first,
             self.spec.episode_limit,
-            self.config.training.reward_scale,
+            scale,
             key_play,
         )
         if not self.spec.scores_wins:

@@ -207,7 +207,13 @@ class ModelFree:
         policy = policies(learner.policy.filter, learner.policy.actor, view)
         action = rows.prev_action[:, 1:]
         ppo = PPORows(
-            view, action, policy.log_prob(action), (advantage - mean) / (std + 1e-5), target, weight
+            view,
+            action,
+            policy.log_prob(action),
+            (advantage - mean) / (std + 1e-5),
+            target,
+            weight,
+            value_weight=weight,
         )
         length = config.chunk_length
 

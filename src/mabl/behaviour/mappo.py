@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -82,6 +82,9 @@ class MAPPOConfig:
     replay_value_coef: float = 0.0
     """Weight of the critic's error on replayed sequences beside that on imagined ones (ADR 8); 0 in
     the paper."""
+    critic_rows: Literal["all", "starts"] = "all"
+    """Imagined rows that the critic learns from: all, as in the paper, or the start rows alone,
+    whose latents are inferred from real observations (ADR 22)."""
     normalise_advantage: bool = True
     """Give advantages zero mean and unit variance over the imagined rows that the policy's loss
     counts."""
@@ -139,6 +142,9 @@ class PPORows(NamedTuple):
     advantage: Array
     target: Array
     weight: Array
+    """How much a row counts for the policy."""
+    value_weight: Array
+    """How much a row counts for the critic."""
 
 
 class ValueRows(NamedTuple):
@@ -146,7 +152,7 @@ class ValueRows(NamedTuple):
 
     view: TeamView
     target: Array
-    weight: Array
+    value_weight: Array
 
 
 class MAPPO(NamedTuple):
@@ -267,6 +273,7 @@ def experience(
         else advantage,
         target,
         weight,
+        weight if config.critic_rows == "all" else weight.at[1:].set(0.0),
     )
     return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
 
@@ -352,7 +359,7 @@ def critic_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """`value_coef` times the squared error to the lambda-returns."""
     error = jax.vmap(critic)(rows.view.critic_features) - rows.target
-    loss = value_coef * weighted_mean(error**2, rows.weight)
+    loss = value_coef * weighted_mean(error**2, rows.value_weight)
     return loss, {"behaviour/critic_loss": loss}
 
 
@@ -370,7 +377,7 @@ def update(
     update, estimated on one minibatch's actions (`kl_of_choices`).
     """
     rows, metrics = experience(state.value, trajectory, config)
-    returns = state.returns.update(rows.target, rows.weight, config.value_decay)
+    returns = state.returns.update(rows.target, rows.value_weight, config.value_decay)
     rows = rows._replace(target=returns.normalise(rows.target))
     if replayed is not None:
         replayed = replayed._replace(target=returns.normalise(replayed.target))

@@ -185,5 +185,5 @@ def value_loss(
     """`value_coef` times the Huber loss to the normalised returns; the critic speaks normalised."""
     value = jax.vmap(jax.vmap(critic))(rows.view.critic_features, rows.view.alive)
     loss = optax.huber_loss(value, returns.normalise(rows.target), delta=HUBER_DELTA)
-    loss = value_coef * weighted_mean(loss, rows.weight)
+    loss = value_coef * weighted_mean(loss, rows.value_weight)
     return loss, {"behaviour/critic_loss": loss}
