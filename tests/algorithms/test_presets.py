@@ -19,7 +19,7 @@ from mabl.errors import UserError
         ("paper", "smax/3s_vs_5z", "mamba", 2e-4, 1.0),  # its own on every map
         ("quick", "smax/3m", "mabl", 1e-3, 1.0),
         ("quick", "smax/3m", "mamba", 1e-3, 1.0),
-        ("efficient", "smax/3m", "mabl", 1e-3, 20.0),
+        ("efficient", "smax/3m", "mabl", 2e-3, 20.0),
         ("quick", "smax/2s3z", "mabl", 1e-3, 20.0),
         ("quick", "smax/2s3z", "mamba", 1e-3, 20.0),
     ],
