@@ -26,6 +26,7 @@ import tyro
 from einops import rearrange
 from jaxtyping import Array, Float
 
+from benchmarks.agreement import agreement
 from mabl import replay as replays
 from mabl.algorithms.base import Experience
 from mabl.algorithms.model_based import Learner, ModelBased
@@ -193,9 +194,11 @@ class Oracle(NamedTuple):
         return after, model_metrics | policy_metrics | ended
 
     def diagnose(self, state: TrainState) -> Metrics:
-        """Compute the world model's diagnostics, as `mabl train` does."""
+        """Compute the world model's diagnostics, as `mabl train` does, and its `agreement`."""
         rows = state.replay._replace(rows=state.replay.rows.row)
-        return self.algorithm.diagnose(state.learner, rows, jax.random.fold_in(state.key, 1))
+        key = jax.random.fold_in(state.key, 1)
+        metrics = self.algorithm.diagnose(state.learner, rows, key)
+        return metrics | agreement(self, state, jax.random.fold_in(key, 1))
 
     def collect(
         self, learner: Learner, collectors: Collector, key: PRNGKey

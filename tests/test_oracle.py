@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from benchmarks import oracle as instrument
 from benchmarks import oracle_table
+from benchmarks.agreement import action_values, within_states
 from benchmarks.oracle import Oracle, Parts
 from numpy.testing import assert_allclose, assert_array_equal
 from tests.tiny import flags, tiny
@@ -182,3 +183,35 @@ def test_scores_of_an_evaluation_are_means_over_seeds():
         "| e | s | 0, 1 | 0.50 (0.25 to 0.75) | 0.50 (0.50 to 0.50) | 1.0 |"
     )
     assert_allclose(oracle_table.score_of({"episode_return": 3.0}), 3.0)
+
+
+def test_agreement_is_the_correlation_within_states_by_hand():
+    """Deviations (-1, 1), (-2, 2) against (-1, 1), (2, -2): (2 - 8) / sqrt(10 * 10)."""
+    a = jnp.array([[0.0, 2.0], [10.0, 14.0]])
+    b = jnp.array([[5.0, 7.0], [3.0, -1.0]])
+    assert_allclose(within_states(a, b), -0.6, rtol=1e-6)
+    assert_allclose(within_states(a, 3 * a + jnp.array([[7.0], [-50.0]])), 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("algo", ["mabl", "mamba"])
+def test_the_simulators_side_of_agreement_follows_the_rules_of_the_task(algo):
+    """Rewards are 0 or the scale; an untrained model says something else."""
+    config = tiny(algo)
+    training = build(config)
+    oracle = Oracle(training.env, training.algorithm, Parts("latents", *3 * ("learned",)))
+
+    @jax.jit
+    def values(key):
+        state, _ = oracle.cycle(oracle.init(key), 0, 0, 1000)
+        begun = jax.tree.map(lambda x: x[:, :4].reshape(-1, *x.shape[2:]), state.replay.rows)
+        latent = training.algorithm.dream(state.learner).model.initial()
+        keys = jax.random.split(jax.random.key(1), begun.row.is_first.shape[0])
+        return jax.vmap(
+            lambda env_state, row, key: action_values(
+                oracle, state.learner, env_state, row, latent, key
+            )
+        )(begun.env_state, begun.row, keys)
+
+    (paid, worth), (said, _) = np.moveaxis(np.asarray(values(jax.random.key(0))), (2, 3), (0, 1))
+    assert (np.isclose(paid, 0) | np.isclose(paid, SCALE)).all() and 0 < paid.mean() < SCALE
+    assert np.isfinite(worth).all() and not np.allclose(said, paid, atol=0.5)
