@@ -1,4 +1,4 @@
-"""Do the world model and the simulator rank joint actions alike?
+"""Compare how the world model and the simulator rank joint actions.
 
 For some replayed states and several joint actions in each, one step is taken in the model and one
 in the simulator; the critic values what either leads to. Policies learn from differences between
@@ -27,7 +27,7 @@ ACTIONS = 8
 DRAWS = 8
 """Steps of either world that an action's value averages over."""
 HISTORY = 5
-"""Rows before a state, at least, from which its latent is inferred."""
+"""Rows of a sequence before a state; a reset may lie between."""
 
 
 def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:

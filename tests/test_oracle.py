@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.tiny import flags, tiny
 
 from mabl.algorithms.base import Experience
+from mabl.behaviour.mappo import MAPPO
 from mabl.training.programs import build
 
 SCALE = 10.0
@@ -193,18 +194,25 @@ def test_agreement_is_the_correlation_within_states_by_hand():
     assert_allclose(within_states(a, 3 * a + jnp.array([[7.0], [-50.0]])), 1.0, rtol=1e-6)
 
 
+class Seven(MAPPO):
+    """Values everything 7."""
+
+    def value(self, state, view):
+        return jnp.full(view.alive.shape, 7.0)
+
+
 @pytest.mark.parametrize("algo", ["mabl", "mamba"])
 def test_the_simulators_side_of_agreement_follows_the_rules_of_the_task(algo):
-    """Rewards are 0 or the scale; an untrained model says something else."""
-    config = tiny(algo)
-    training = build(config)
-    oracle = Oracle(training.env, training.algorithm, Parts("latents", *3 * ("learned",)))
+    """Rewards are 0 or the scale, and what row 3 leads to is worth nothing; a model says more."""
+    training = build(tiny(algo))
+    algorithm = training.algorithm._replace(behaviour=Seven(*training.algorithm.behaviour))
+    oracle = Oracle(training.env, algorithm, Parts("latents", *3 * ("learned",)))
 
     @jax.jit
     def values(key):
         state, _ = oracle.cycle(oracle.init(key), 0, 0, 1000)
         begun = jax.tree.map(lambda x: x[:, :4].reshape(-1, *x.shape[2:]), state.replay.rows)
-        latent = training.algorithm.dream(state.learner).model.initial()
+        latent = algorithm.dream(state.learner).model.initial()
         keys = jax.random.split(jax.random.key(1), begun.row.is_first.shape[0])
         return jax.vmap(
             lambda env_state, row, key: action_values(
@@ -212,6 +220,10 @@ def test_the_simulators_side_of_agreement_follows_the_rules_of_the_task(algo):
             )
         )(begun.env_state, begun.row, keys)
 
-    (paid, worth), (said, _) = np.moveaxis(np.asarray(values(jax.random.key(0))), (2, 3), (0, 1))
+    found = np.asarray(values(jax.random.key(0)))  # [2 lanes of rows 0 to 3, A, 2, 2]
+    (paid, worth), (said, promised) = np.moveaxis(found, (2, 3), (0, 1))
     assert (np.isclose(paid, 0) | np.isclose(paid, SCALE)).all() and 0 < paid.mean() < SCALE
-    assert np.isfinite(worth).all() and not np.allclose(said, paid, atol=0.5)
+    expected = algorithm.config.mappo.gamma * 7.0 * np.array([1, 1, 1, 0] * 2)
+    assert_allclose(worth, np.broadcast_to(expected[:, None], worth.shape), rtol=1e-5)
+    assert not np.allclose(said, paid, atol=0.5)
+    assert (promised > 0).all() and (promised < algorithm.config.mappo.gamma * 7.0).all()

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from tests.tiny import tiny
 
 from mabl import replay as replays
@@ -50,11 +50,15 @@ def collected(n_rows: int, n_cycles: int, capacity: int):
         yield lanes, collectors
 
 
-@pytest.mark.parametrize("length", [3, 8])
-@pytest.mark.parametrize("capacity", [11, 100])
+@pytest.mark.parametrize(
+    ("length", "capacity"), [(3, 11), (3, 100), (8, 11), (8, 100), (5, 5), (8, 8)]
+)
 def test_a_memory_is_recalled_from_the_rows_before_the_newest_by_hand(length, capacity):
-    """Weight 3 sums 3 (s + 1) over rows s of the episode before row t, `length` of them at most."""
-    seen = set()
+    """Weight 3 sums 3 (s + 1) over rows s of the episode before row t, `length` of them at most.
+
+    Of a full lane one row less than its capacity comes before the newest.
+    """
+    seen, reach = set(), min(length, capacity - 1)
     for lanes, collectors in collected(n_rows=5, n_cycles=6, capacity=capacity):
         keys = jax.random.split(jax.random.key(9), LANES)
         recalled = jax.vmap(lambda *lane: recalled_memory(Tally(3.0), length, *lane))(
@@ -65,9 +69,9 @@ def test_a_memory_is_recalled_from_the_rows_before_the_newest_by_hand(length, ca
             if t == 0:  # whatever it was, it is forgotten
                 continue
             seen.add(t)
-            expected = 3.0 * sum(s + 1 for s in range(max(t - length, 0), t))
+            expected = 3.0 * sum(s + 1 for s in range(max(t - reach, 0), t))
             assert_array_equal(recalled[lane], np.full(2, expected))
-            if length >= t:
+            if reach >= t:
                 assert_array_equal(recalled[lane], 3 * collectors.memory[lane])
     assert {1, 2, 4, 5} <= seen
 
@@ -106,3 +110,27 @@ def test_updates_change_memories(algo, whole_episodes, recalls):
     without, after = map(jax.tree.leaves, jax.device_get(run(jax.random.key(0))))
     same = [np.array_equal(a, b) for a, b in zip(without, after, strict=True)]
     assert all(same) != recalls
+
+
+def test_without_updates_a_cycle_recalls_what_was_remembered():
+    """QMIX's memory draws nothing, and holds the whole episode: at most 7 of its 8 rows."""
+    training = build(tiny("qmix", "test/counting"))
+
+    @jax.jit
+    def run(state, key):
+        collectors, landed = training.collect(state.learner, state.collectors, key)
+        return collectors, training.learn(state, collectors, landed, 0, 0, 1000)[0]
+
+    state, compared = jax.jit(training.init)(jax.random.key(0)), 0
+    for number in range(4):
+        collectors, state = run(state, jax.random.key(number))
+        inside = np.flatnonzero(~collectors.row.is_first)
+        compared += len(inside)
+        for carried, recalled in zip(
+            jax.tree.leaves(collectors.memory),
+            jax.tree.leaves(state.collectors.memory),
+            strict=True,
+        ):
+            assert np.abs(carried[inside]).max() > 0
+            assert_allclose(recalled[inside], carried[inside], atol=1e-5)
+    assert compared >= 4

@@ -1,4 +1,4 @@
-"""How good the world model is, in numbers a user can act on."""
+"""Diagnostics of a world model, and of values of its latents, on replayed rows."""
 
 from collections.abc import Callable
 from typing import TypeVar

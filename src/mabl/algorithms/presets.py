@@ -194,8 +194,8 @@ QUICK = _QUICK | {
 
 
 def _efficient(quick: Config) -> Config:
-    """100 replayed rows for each environment step, where `quick` has 22; policies see more exactly
-    (ADR 22)."""
+    """100 replayed rows for each environment step, where `quick` has 22; policies also see
+    the decoded observation (ADR 22)."""
     return replace(
         quick,
         preset="efficient",

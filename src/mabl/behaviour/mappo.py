@@ -142,9 +142,9 @@ class PPORows(NamedTuple):
     advantage: Array
     target: Array
     weight: Array
-    """How much a row counts for the policy."""
+    """Weight of a row in the policy's loss."""
     value_weight: Array
-    """How much a row counts for the critic."""
+    """Weight of a row in the critic's loss."""
 
 
 class ValueRows(NamedTuple):
