@@ -1,10 +1,12 @@
 """Compare how the world model and the simulator rank joint actions.
 
-For some replayed states and several joint actions in each, one step is taken in the model and one
-in the simulator; the critic values what either leads to. Policies learn from differences between
-the actions of a state, so that their correlation within states says how well imagination teaches.
+For some replayed states and several joint actions in each, some steps are taken in the model and in
+the simulator, after the first by the policy; the critic values what either leads to. Policies learn
+from differences between the actions of a state, so that their correlation within states says how
+well imagination teaches.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,6 +15,7 @@ from einops import rearrange
 from jaxtyping import Array, Float
 
 from mabl import replay as replays
+from mabl.algorithms.diagnostics import DIAGNOSED_ROWS, WARM_UP
 from mabl.envs.base import Discrete
 from mabl.imagination import Imagined
 from mabl.nets.categorical import still
@@ -25,31 +28,37 @@ STATES = 192
 ACTIONS = 8
 """Joint actions in each state: each is drawn by the policy or uniformly, with equal chances."""
 DRAWS = 8
-"""Steps of either world that an action's value averages over."""
-HISTORY = 5
-"""Rows of a sequence before a state; a reset may lie between."""
+"""Trajectories of either world that an action's value averages over."""
+STEPS = (1, 5)
+"""Steps after which the critic values what an action has led to."""
+
+State = Any
+Outcome = tuple[State, Float[Array, ""], Float[Array, ""], Float[Array, ""]]
+"""State of a world after a step, its reward, its probability of going on, and the state's value."""
 
 
 def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:
-    """Compare one-step values of joint actions, r + gamma V(next), in the model and the simulator.
+    """Compare k-step values of joint actions, in the model and in the simulator.
 
-    Returns `action_correlation` of r + gamma V, `action_reward_correlation` of r,
-    `action_value_correlation` of gamma V, `action_std` and `action_std_model` (standard deviations
-    over the actions of a state), and `action_value_bias`: how much higher gamma V is in the model,
-    in scaled rewards.
+    Of action a at row t it is the mean of r_{t+1} + ... + gamma^k V(row t + k), where the actions
+    after a are the policy's. Returns for each k of `STEPS`
+
+    - `action_correlation_k` between model and simulator; `action_ceiling_k` between two halves of
+      the simulator's own trajectories, which a perfect model would have;
+    - `action_reward_correlation_k` of the rewards alone, `action_value_correlation_k` of V alone;
+    - `action_std_k` and `action_std_model_k`, standard deviations over the actions of a state;
+    - `action_value_bias_k`, the mean by which V is higher in the model, in scaled rewards.
     """
-    key_sample, key_observe, key_choose, key_act = jax.random.split(key, 4)
     algorithm, learner = oracle.algorithm, state.learner
-    recorded = replays.sample_sequences(
-        state.replay, key_sample, SEQUENCES, algorithm.config.world_model.batch_length
-    )
+    key_sample, key_observe, key_choose, key_act = jax.random.split(key, 4)
+    recorded = replays.sample_sequences(state.replay, key_sample, SEQUENCES, DIAGNOSED_ROWS)
     latents = still(
         jax.vmap(lambda *at: observe_sequence(learner.model, *at)[0])(
             recorded.row, jax.random.split(key_observe, SEQUENCES)
         )
     )
     states = jax.tree.map(
-        lambda x: rearrange(x[:, HISTORY:], "b t ... -> (b t) ..."),
+        lambda x: rearrange(x[:, WARM_UP:], "b t ... -> (b t) ..."),
         (recorded.env_state, recorded.row, latents),
     )
     last = is_last(states[1])
@@ -57,48 +66,95 @@ def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:
     chosen = jax.tree.map(lambda x: x[order], states)
     keys = jax.random.split(key_act, order.shape[0])
     values = jax.lax.map(lambda at: action_values(oracle, learner, *at), (*chosen, keys))
-    true, said = values[..., 0, :], values[..., 1, :]  # [S, A, (reward, value)]
-    return {
-        "action_correlation": within_states(true.sum(-1), said.sum(-1)),
-        "action_reward_correlation": within_states(true[..., 0], said[..., 0]),
-        "action_value_correlation": within_states(true[..., 1], said[..., 1]),
-        "action_std": true.sum(-1).std(1).mean(),
-        "action_std_model": said.sum(-1).std(1).mean(),
-        "action_value_bias": (said[..., 1] - true[..., 1]).mean(),
-    }
+    metrics = {}
+    for i, k in enumerate(STEPS):
+        true, again, said = (values[:, :, world, :, i] for world in range(3))
+        metrics |= {
+            f"action_correlation_{k}": within_states(true.sum(-1), said.sum(-1)),
+            f"action_ceiling_{k}": within_states(true.sum(-1), again.sum(-1)),
+            f"action_reward_correlation_{k}": within_states(true[..., 0], said[..., 0]),
+            f"action_value_correlation_{k}": within_states(true[..., 1], said[..., 1]),
+            f"action_std_{k}": true.sum(-1).std(1).mean(),
+            f"action_std_model_{k}": said.sum(-1).std(1).mean(),
+            f"action_value_bias_{k}": (said[..., 1] - true[..., 1]).mean(),
+        }
+    return metrics
 
 
 def action_values(
     oracle: Any, learner: Any, env_state: Any, row: Any, latent: Any, key: PRNGKey
-) -> Float[Array, "A 2 2"]:
-    """Mean reward and discounted value after some joint actions: by the simulator, by the model."""
-    algorithm, behaviour = oracle.algorithm, oracle.algorithm.behaviour
+) -> Float[Array, "A 3 2 K"]:
+    """Mean rewards and discounted values after some joint actions and `STEPS` steps.
+
+    By the simulator, by the simulator again, and by the model.
+    """
+    algorithm = oracle.algorithm
     dream, space = algorithm.dream(learner), algorithm.spec.action_space
-    scale, gamma = algorithm.config.training.reward_scale, algorithm.config.mappo.gamma
+    scale = algorithm.config.training.reward_scale
     now = Imagined(latent, row.available, row.alive)
 
-    def value(view: Any) -> Array:
-        return gamma * behaviour.value(learner.behaviour, view).mean()
+    def value(state: Imagined) -> Array:
+        return algorithm.behaviour.value(learner.behaviour, dream.view(state)).mean()
 
-    def draw(action: Array, key: PRNGKey) -> Float[Array, "2 2"]:
-        key_env, key_model, key_observe = jax.random.split(key, 3)
-        _, after = oracle.env.step(key_env, env_state, action.astype(space.dtype))
-        seen = learner.model.observe(latent, learner.model.encode(after), key_observe)[0]
-        view = algorithm.view(learner.model, still(seen), after.available, after.alive)
-        true = after.reward.mean() * scale, (1 - after.terminated.mean()) * value(view)
-        imagined, said = dream.step(now, action, key_model)
-        goes_on = dream.continues(said).mean()
-        model = said.reward.mean(), goes_on * value(dream.view(imagined))
-        return jnp.array([true, model])
+    def simulate(state: State, action: Array, key: PRNGKey) -> Outcome:
+        env_state, at = state
+        key_env, key_observe = jax.random.split(key)
+        env_state, after = oracle.env.step(key_env, env_state, action.astype(space.dtype))
+        seen = learner.model.observe(at.latent, learner.model.encode(after), key_observe)[0]
+        at = Imagined(still(seen), after.available, after.alive)
+        reward, goes_on = after.reward.mean() * scale, 1 - after.terminated.mean()
+        return (env_state, at), reward, goes_on, value(at)
 
-    def one(key: PRNGKey) -> Float[Array, "2 2"]:
-        key_policy, key_uniform, key_which, key_draws = jax.random.split(key, 4)
-        action, _ = dream.act(now, key_policy)
+    def imagine(state: State, action: Array, key: PRNGKey) -> Outcome:
+        _, at = state
+        at, said = dream.step(at, action, key)
+        return (None, at), said.reward.mean(), dream.continues(said).mean(), value(at)
+
+    def act(state: State, key: PRNGKey) -> Array:
+        return dream.act(state[1], key)[0]
+
+    def mean_of_draws(step: Callable, start: State, action: Array, key: PRNGKey) -> Array:
+        keys = jax.random.split(key, DRAWS)
+        gamma = algorithm.config.mappo.gamma
+        return jax.vmap(lambda key: returns(step, act, start, action, gamma, key))(keys).mean(0)
+
+    def one(key: PRNGKey) -> Float[Array, "3 2 K"]:
+        key_policy, key_uniform, key_which, *keys = jax.random.split(key, 6)
+        action = act((None, now), key_policy)
         uniform = uniform_action(space, row.available, key_uniform)
         action = jnp.where(jax.random.bernoulli(key_which), action, uniform)
-        return jax.vmap(lambda key: draw(action, key))(jax.random.split(key_draws, DRAWS)).mean(0)
+        worlds = (simulate, env_state), (simulate, env_state), (imagine, None)
+        return jnp.stack(
+            [
+                mean_of_draws(step, (start, now), action, key)
+                for (step, start), key in zip(worlds, keys, strict=True)
+            ]
+        )
 
     return jax.vmap(one)(jax.random.split(key, ACTIONS))
+
+
+def returns(
+    step: Callable[[State, Array, PRNGKey], Outcome],
+    act: Callable[[State, PRNGKey], Array],
+    start: State,
+    action: Array,
+    gamma: float,
+    key: PRNGKey,
+) -> Float[Array, "2 K"]:
+    """Discounted rewards of one trajectory, and discounted values of its states, at `STEPS`."""
+
+    def advance(carry: tuple, key: PRNGKey) -> tuple[tuple, tuple[Array, Array]]:
+        state, action, weight = carry
+        key_step, key_act = jax.random.split(key)
+        state, reward, goes_on, value = step(state, action, key_step)
+        after = gamma * goes_on * weight
+        return (state, act(state, key_act), after), (weight * reward, after * value)
+
+    keys = jax.random.split(key, max(STEPS))
+    _, (rewards, values) = jax.lax.scan(advance, (start, action, jnp.float32(1)), keys)
+    at = jnp.array(STEPS) - 1
+    return jnp.stack([jnp.cumsum(rewards)[at], values[at]])
 
 
 def uniform_action(space: Any, available: Array, key: PRNGKey) -> Array:

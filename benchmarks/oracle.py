@@ -45,8 +45,8 @@ from mabl.rollout import Collector, Episodes, advance, start
 from mabl.rows import TimeStep, is_last
 from mabl.runs import folder
 from mabl.runs.checkpoint import Checkpoints
-from mabl.training.loop import TrainState, repeat, with_recalled_memories
-from mabl.training.programs import as_in_a_run, build
+from mabl.training.loop import TrainState, cycle_keys, repeat, with_recalled_memories
+from mabl.training.programs import DIAGNOSE, as_in_a_run, build
 from mabl.types import Metrics, PRNGKey, Replayed, TeamView, Trajectory
 from mabl.world_models.sequences import observe_sequence
 
@@ -159,8 +159,8 @@ class Oracle(NamedTuple):
         self, state: TrainState, n_model: Array, n_policy: Array, total_steps: Array
     ) -> tuple[TrainState, Metrics]:
         """`Training.cycle`, with imagination replaced."""
-        key, key_collect, key_model, key_policy = jax.random.split(state.key, 4)
-        collectors, recorded, episodes = self.collect(state.learner, state.collectors, key_collect)
+        keys = cycle_keys(state.key)
+        collectors, recorded, episodes = self.collect(state.learner, state.collectors, keys.collect)
         count = jnp.full(recorded.row.is_first.shape[0], recorded.row.is_first.shape[1])
         replay = jax.vmap(replays.add)(state.replay, recorded, count)
         rows = replay._replace(rows=replay.rows.row)
@@ -171,7 +171,7 @@ class Oracle(NamedTuple):
             learner, model_metrics = repeat(
                 lambda learner, key: self.algorithm.update_model(learner, experience, key),
                 learner,
-                key_model,
+                keys.model,
                 n_model,
             )
 
@@ -182,13 +182,18 @@ class Oracle(NamedTuple):
             imagined = self.imagine(learner, replay, key_imagine)
             return self.algorithm.learn(learner, *imagined, key_learn, progress)
 
-        learner, policy_metrics = repeat(update_policy, learner, key_policy, n_policy)
+        learner, policy_metrics = repeat(update_policy, learner, keys.policy, n_policy)
         collectors = with_recalled_memories(
-            self.algorithm, self.executor(learner), rows, collectors, jax.random.fold_in(key, 1)
+            self.algorithm, self.executor(learner), rows, collectors, keys.recall
         )
         steps = (~recorded.row.is_first).sum(dtype=jnp.int32)
         after = TrainState(
-            learner, replay, collectors, key, state.env_steps + steps, state.model_updates + n_model
+            learner,
+            replay,
+            collectors,
+            keys.after,
+            state.env_steps + steps,
+            state.model_updates + n_model,
         )
         ended = {f"episodes/{name}": x.sum() for name, x in episodes._asdict().items()}
         return after, model_metrics | policy_metrics | ended
@@ -196,9 +201,9 @@ class Oracle(NamedTuple):
     def diagnose(self, state: TrainState) -> Metrics:
         """Compute the world model's diagnostics, as `mabl train` does, and its `agreement`."""
         rows = state.replay._replace(rows=state.replay.rows.row)
-        key = jax.random.fold_in(state.key, 1)
-        metrics = self.algorithm.diagnose(state.learner, rows, key)
-        return metrics | agreement(self, state, jax.random.fold_in(key, 1))
+        key_model, key_agreement = jax.random.split(jax.random.fold_in(state.key, DIAGNOSE))
+        metrics = self.algorithm.diagnose(state.learner, rows, key_model)
+        return metrics | agreement(self, state, key_agreement)
 
     def collect(
         self, learner: Learner, collectors: Collector, key: PRNGKey

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from benchmarks import oracle as instrument
 from benchmarks import oracle_table
-from benchmarks.agreement import action_values, within_states
+from benchmarks.agreement import action_values, returns, within_states
 from benchmarks.oracle import Oracle, Parts
 from numpy.testing import assert_allclose, assert_array_equal
 from tests.tiny import flags, tiny
 
 from mabl.algorithms.base import Experience
 from mabl.behaviour.mappo import MAPPO
+from mabl.nets.categorical import still
 from mabl.training.programs import build
 
 SCALE = 10.0
@@ -212,7 +213,7 @@ def test_the_simulators_side_of_agreement_follows_the_rules_of_the_task(algo):
     def values(key):
         state, _ = oracle.cycle(oracle.init(key), 0, 0, 1000)
         begun = jax.tree.map(lambda x: x[:, :4].reshape(-1, *x.shape[2:]), state.replay.rows)
-        latent = algorithm.dream(state.learner).model.initial()
+        latent = still(algorithm.dream(state.learner).model.initial())
         keys = jax.random.split(jax.random.key(1), begun.row.is_first.shape[0])
         return jax.vmap(
             lambda env_state, row, key: action_values(
@@ -220,10 +221,40 @@ def test_the_simulators_side_of_agreement_follows_the_rules_of_the_task(algo):
             )
         )(begun.env_state, begun.row, keys)
 
-    found = np.asarray(values(jax.random.key(0)))  # [2 lanes of rows 0 to 3, A, 2, 2]
-    (paid, worth), (said, promised) = np.moveaxis(found, (2, 3), (0, 1))
-    assert (np.isclose(paid, 0) | np.isclose(paid, SCALE)).all() and 0 < paid.mean() < SCALE
-    expected = algorithm.config.mappo.gamma * 7.0 * np.array([1, 1, 1, 0] * 2)
-    assert_allclose(worth, np.broadcast_to(expected[:, None], worth.shape), rtol=1e-5)
+    found = np.asarray(values(jax.random.key(0)))  # [2 lanes of rows 0 to 3, A, 3, 2, K]
+    gamma, left = algorithm.config.mappo.gamma, np.tile(np.arange(4, 0, -1), 2)[:, None]
+    for world in (0, 1):
+        (paid, paid_5), (worth, worth_5) = np.moveaxis(found[:, :, world], (2, 3), (0, 1))
+        assert (np.isclose(paid, 0) | np.isclose(paid, SCALE)).all() and 0 < paid.mean() < SCALE
+        expected = gamma * 7.0 * (left > 1)
+        assert_allclose(worth, np.broadcast_to(expected, worth.shape), rtol=1e-5)
+        assert_allclose(worth_5, 0)  # no episode has five steps
+        later, bound = paid_5 - paid, SCALE * sum(gamma**i * (left > i) for i in range(1, 4))
+        assert (later >= -1e-4).all() and (later <= bound + 1e-4).all()
+        assert later[left[:, 0] > 1].mean() > 0.1 * SCALE
+    (said, _), (promised, _) = np.moveaxis(found[:, :, 2], (2, 3), (0, 1))
     assert not np.allclose(said, paid, atol=0.5)
-    assert (promised > 0).all() and (promised < algorithm.config.mappo.gamma * 7.0).all()
+    assert (promised > 0).all() and (promised < gamma * 7.0).all()
+
+
+def test_returns_of_a_trajectory_by_hand():
+    """Rewards 1, 2, ..; goes on with .5 each time; V of state n is 100 n; gamma .8.
+
+    After one step: 1 and .8 (.5) 100. After five: sum of .4^i (i + 1), and .4^5 500. The step sees
+    the first action, then the policy's.
+    """
+    seen = []
+
+    def step(state, action, key):
+        del key
+        seen.append(action)
+        return state + 1, action + state, jnp.float32(0.5), 100.0 * (state + 1)
+
+    def act(state, key):
+        del state, key
+        return jnp.float32(1.0)
+
+    with jax.disable_jit():
+        found = returns(step, act, jnp.float32(0), jnp.float32(1.0), 0.8, jax.random.key(0))
+    rewards = [1.0, sum(0.4**i * (i + 1) for i in range(5))]
+    assert_allclose(found, [rewards, [0.4 * 100, 0.4**5 * 500]], rtol=1e-6)

@@ -15,7 +15,7 @@ from mabl.errors import require_between, require_positive
 from mabl.nets.categorical import still
 from mabl.nets.mlp import Features
 from mabl.types import PRNGKey, TeamView, Trajectory
-from mabl.world_models.base import WorldModel, WorldModelConfig
+from mabl.world_models.base import WorldModel, WorldModelConfig, with_life
 from mabl.world_models.heads import Predictions
 from mabl.world_models.sequences import predict_step
 
@@ -94,10 +94,7 @@ class Dream(NamedTuple):
             available = jax.nn.sigmoid(predicted.available) > threshold
         drawn = jax.random.uniform(key_alive, state.alive.shape) if self.config.sample_life else 0.5
         alive = state.alive & (jax.nn.sigmoid(predicted.alive) > drawn)
-        with_life = getattr(self.model, "with_life", None)
-        if with_life is not None:  # the latent also tells who is alive
-            latent = with_life(latent, alive)
-        return Imagined(latent, available, alive), predicted
+        return Imagined(with_life(self.model, latent, alive), available, alive), predicted
 
     def continues(self, predicted: Predictions) -> Float[Array, " N"]:
         """Each agent's probability that the episode goes on after a row."""

@@ -71,11 +71,12 @@ def sample_sequences(
     capacity = _rows_in(replay.rows, axis=1)
     starts = jnp.maximum(replay.size - length + 1, 0)
     ends = jnp.cumsum(starts)
-    pick = jax.random.randint(key, (batch_size,), 0, ends[-1])
+    key_pick, key_age = jax.random.split(key)
+    pick = jax.random.randint(key_pick, (batch_size,), 0, ends[-1])
     lane = jnp.searchsorted(ends, pick, side="right")
     age = pick - (ends - starts)[lane]
     if recency != 1.0:
-        share = jax.random.uniform(jax.random.fold_in(key, 1), (batch_size,)) ** (1 / recency)
+        share = jax.random.uniform(key_age, (batch_size,)) ** (1 / recency)
         age = jnp.minimum((share * starts[lane]).astype(age.dtype), starts[lane] - 1)
     oldest = (replay.cursor - replay.size)[lane]
     index = ((oldest + age)[:, None] + jnp.arange(length)[None]) % capacity

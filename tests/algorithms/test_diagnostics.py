@@ -113,6 +113,31 @@ def test_the_value_gap_is_that_of_the_prior_over_the_posterior_of_the_same_row_b
     assert told["behaviour/value_gap"] == pytest.approx(sum(gaps) / 3 / 4)
 
 
+class Counting(Adding):
+    """It also holds the number of the living, as a fraction."""
+
+    def with_life(self, latent, alive):
+        return latent + alive.sum() / 8
+
+
+def test_the_value_gap_leaves_out_unknown_pasts_and_tells_the_prior_who_lives():
+    """A sequence begins in mid-episode: latents of rows 5 and 6 are known, those before are not."""
+    _, row = CountingEnv().reset(jax.random.key(0))
+    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, 8, *x.shape)), row)
+    alive = jnp.ones((1, 8, 2), bool).at[0, 6, 0].set(False)
+    rows = rows._replace(
+        prev_action=jnp.zeros((1, 8, 2), jnp.int32), is_first=jnp.zeros((1, 8), bool), alive=alive
+    )
+    latents = jnp.array([[9.0, 8.0, 7.0, 6.0, 5.0, 1.0, 4.0, 2.0]])
+
+    def value(latent, row):
+        return latent
+
+    told = value_metrics(Counting(), value, latents, rows, jax.random.key(0), Discrete(3), 1.0)
+    gaps = (1 + 10 + 1 / 8) - 4, (4 + 10 + 2 / 8) - 2
+    assert told["behaviour/value_gap"] == pytest.approx(sum(gaps) / 2)
+
+
 def test_masked_mean():
     mean = masked_mean(jnp.array([1.0, 5.0, 9.0]), jnp.array([True, False, True]))
     assert mean == pytest.approx(5.0)

@@ -12,7 +12,7 @@ from mabl.envs.base import ActionSpace
 from mabl.nets.categorical import still
 from mabl.rows import TimeStep, is_last
 from mabl.types import Metrics, PRNGKey
-from mabl.world_models.base import WorldModel, WorldModelConfig
+from mabl.world_models.base import WorldModel, WorldModelConfig, with_life
 from mabl.world_models.heads import Predictions
 from mabl.world_models.sequences import followers, predict_sequence, predict_step
 
@@ -22,6 +22,8 @@ T = TypeVar("T")
 OPEN_LOOP_STEPS = (1, 5, 15)
 DIAGNOSED_ROWS = max(OPEN_LOOP_STEPS) + 5
 """Rows of the sequences that diagnostics look at."""
+WARM_UP = 5
+"""Rows after which a latent is taken to know the past."""
 
 
 def diagnose(
@@ -87,11 +89,14 @@ def value_metrics(
 
     `behaviour/value_gap` is the mean of V(prior latent) - V(posterior latent) of the same row, the
     prior's drawn one step ahead with the real action. Above 0, the critic promises more of
-    imagination than of the world. Both metrics are in the environment's units.
+    imagination than of the world. The first `WARM_UP` rows of a sequence, whose past the latent does
+    not know, do not count unless they follow a reset in it. Both metrics are in the environment's
+    units.
     """
 
     def ahead(latent: L, row: TimeStep, key: PRNGKey) -> Float[Array, ""]:
-        return value(model.imagine(latent, action_space.encode(row.prev_action), key), row)
+        latent = model.imagine(latent, action_space.encode(row.prev_action), key)
+        return value(with_life(model, latent, row.alive), row)
 
     values = jax.vmap(jax.vmap(value))(latents, rows)
     before, after = (
@@ -100,9 +105,12 @@ def value_metrics(
     )
     keys = jax.random.split(key, after.is_first.shape)
     gap = jax.vmap(jax.vmap(ahead))(before, after, keys) - values[:, 1:]
+    warm = jnp.arange(rows.is_first.shape[1]) >= WARM_UP
+    known = warm[None] | (jnp.cumsum(rows.is_first, axis=1) > 0)
+    counted = known[:, :-1] & ~after.is_first & ~is_last(after)
     return {
         "behaviour/value_at_reset": masked_mean(values, rows.is_first) / reward_scale,
-        "behaviour/value_gap": masked_mean(gap, ~after.is_first & ~is_last(after)) / reward_scale,
+        "behaviour/value_gap": masked_mean(gap, counted) / reward_scale,
     }
 
 

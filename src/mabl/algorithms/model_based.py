@@ -162,8 +162,7 @@ class ModelBased(NamedTuple):
         Values at resets and imagined episodes are in the environment's units, to compare with the
         episodes of training.
         """
-        key_sample, key_observe, key_diagnose, key_play = jax.random.split(key, 4)
-        key_value = jax.random.fold_in(key_play, 1)
+        key_sample, key_observe, key_diagnose, key_play, key_value = jax.random.split(key, 5)
         rows = sample_sequences(replay, key_sample, N_DIAGNOSED, DIAGNOSED_ROWS)
         latents = self._observe(learner, rows, key_observe)
         metrics = diagnose(

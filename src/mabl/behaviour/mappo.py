@@ -382,12 +382,11 @@ def update(
     if replayed is not None:
         replayed = replayed._replace(target=returns.normalise(replayed.target))
     n_rows = rows.target.shape[0]
-    batches = minibatches(key, n_rows, config.batch_size, config.n_epochs)
+    key_rows, key_replayed = jax.random.split(key)
+    batches = minibatches(key_rows, n_rows, config.batch_size, config.n_epochs)
     if replayed is not None:
         per_epoch = batches.shape[0] // config.n_epochs
-        real_batches = divided(
-            jax.random.fold_in(key, 1), replayed.target.shape[0], per_epoch, config.n_epochs
-        )
+        real_batches = divided(key_replayed, replayed.target.shape[0], per_epoch, config.n_epochs)
     actor_optimiser, critic_optimiser = optimisers(config)
 
     def critic_objective(

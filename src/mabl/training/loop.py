@@ -38,11 +38,12 @@ class CycleKeys(NamedTuple):
     collect: PRNGKey
     model: PRNGKey
     policy: PRNGKey
+    recall: PRNGKey
 
 
 def cycle_keys(key: PRNGKey) -> CycleKeys:
     """Split the key of a state."""
-    return CycleKeys(*jax.random.split(key, 4))
+    return CycleKeys(*jax.random.split(key, len(CycleKeys._fields)))
 
 
 class Training(NamedTuple):
@@ -95,7 +96,7 @@ class Training(NamedTuple):
         their start. Metrics are means over the cycle's updates (NaN if there were none) and sums
         over the cycle.
         """
-        key, _, key_model, key_policy = cycle_keys(state.key)
+        keys = cycle_keys(state.key)
         replay = state.replay
         if isinstance(self.env, Hosted):
             replay = jax.vmap(replays.cut)(replay, state.collectors.row.truncated)
@@ -106,26 +107,22 @@ class Training(NamedTuple):
         learner, model_metrics = repeat(
             lambda learner, key: self.algorithm.update_model(learner, experience, key),
             before,
-            key_model,
+            keys.model,
             n_model,
         )
         learner, policy_metrics = repeat(
             lambda learner, key: self.algorithm.update_policy(learner, experience, key),
             learner,
-            key_policy,
+            keys.policy,
             n_policy,
         )
         state = TrainState(
             learner=learner,
             replay=replay,
             collectors=with_recalled_memories(
-                self.algorithm,
-                self.executor(learner),
-                replay,
-                collectors,
-                jax.random.fold_in(key, 1),
+                self.algorithm, self.executor(learner), replay, collectors, keys.recall
             ),
-            key=key,
+            key=keys.after,
             env_steps=state.env_steps + steps_in(collected),
             model_updates=state.model_updates + n_model,
         )

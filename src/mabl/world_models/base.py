@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mabl.errors import require_between, require_positive
 from mabl.nets.categorical import CodeShape
@@ -144,3 +144,9 @@ class WorldModel(Protocol[L]):
     def critic_features(self, latent: L) -> Features:
         """What critics see; `[N, ...]`."""
         ...
+
+
+def with_life(model: WorldModel[L], latent: L, alive: Bool[Array, " N"]) -> L:
+    """Latent of a model that holds who lives, told so; any other model's as it is."""
+    tell = getattr(model, "with_life", None)
+    return latent if tell is None else tell(latent, alive)

@@ -78,7 +78,7 @@ class Heads(eqx.Module):
 
         Without `obs_dim` there is no decoder of observations.
         """
-        keys = jax.random.split(key, 6)
+        keys = jax.random.split(key, 7)
 
         def decoders(seen: Widths, sizes: tuple[int, ...], keys: Array) -> tuple[Linear, list[MLP]]:
             whole = [
@@ -100,8 +100,7 @@ class Heads(eqx.Module):
         self.full_reward = rest[3] if both_levels_reward else None
         self.win = None
         if wins:
-            key_win = jax.random.fold_in(key, 1)
-            self.win = MLP(full, 1, hidden, n_hidden, key_win, activation=activation)
+            self.win = MLP(full, 1, hidden, n_hidden, keys[6], activation=activation)
 
     def __call__(self, agent: Features, full: Features, obs: Any = None) -> Predictions:
         """Decode one agent's latents: its own level, and all levels.

@@ -175,15 +175,16 @@ class AgentFilter(eqx.Module):
     @classmethod
     def of(cls, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey) -> "AgentFilter":
         """The filter of an environment's agents, as `config` sizes it."""
+        key_own, key_decoder = jax.random.split(key)
         return cls(
             spec.obs_dim,
             spec.action_space.size,
             config.hidden,
             config.latent,
-            key,
+            key_own,
             config.standardise,
             config.activation,
-            policy_decoder(config, spec.obs_dim, jax.random.fold_in(key, 1)),
+            policy_decoder(config, spec.obs_dim, key_decoder),
         )
 
     def initial(self) -> Level:

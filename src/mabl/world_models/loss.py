@@ -45,7 +45,8 @@ def model_loss(
     `config.absorbing` the model also learns that nothing follows an end (`absorbing_loss`).
     """
     rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)  # as the scan over time leaves them
-    observed = observe_batch(model, rows, key, train=True)
+    key_observe, key_absorbing = jax.random.split(key)
+    observed = observe_batch(model, rows, key_observe, train=True)
     follows = followers(rows.is_first)[..., None]
     predicted, std = predict_sequence(model, observed.latents, config), obs_std(model)
     losses = decoder_losses(predicted, rows, config, action_space, std)
@@ -60,7 +61,6 @@ def model_loss(
     for name, loss in kl_losses(observed, config).items():
         losses[name] = loss * (known if loss.ndim > 2 else known[..., 0])
     if config.absorbing:
-        key_absorbing = jax.random.fold_in(key, 1)
         losses["absorbing"] = absorbing_loss(
             model, observed.latents, rows, key_absorbing, config, action_space
         )

@@ -105,7 +105,7 @@ class FilterNets(eqx.Module):
         communication: CommunicationConfig,
         key: PRNGKey,
     ):
-        keys = jax.random.split(key, 5)
+        keys = jax.random.split(key, 6)
         hidden, latent = config.hidden, config.latent
         activation = config.activation
         self.encoder = MLP(spec.obs_dim, hidden, hidden, 2, keys[0], activation=activation)
@@ -115,7 +115,7 @@ class FilterNets(eqx.Module):
         )
         self.cell = GRU(hidden, hidden, keys[3])
         self.posterior = Categoricals((hidden, hidden), hidden, latent, keys[4], activation)
-        self.decoder = policy_decoder(config, spec.obs_dim, jax.random.fold_in(key, 1))
+        self.decoder = policy_decoder(config, spec.obs_dim, keys[5])
 
     def listen(
         self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey | None
