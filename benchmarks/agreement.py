@@ -49,7 +49,7 @@ def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:
     - `action_std_k` and `action_std_model_k`, standard deviations over the actions of a state;
     - `action_value_bias_k`, the mean by which V is higher in the model, in scaled rewards.
     """
-    algorithm, learner = oracle.algorithm, state.learner
+    learner = state.learner
     key_sample, key_observe, key_choose, key_act = jax.random.split(key, 4)
     recorded = replays.sample_sequences(state.replay, key_sample, SEQUENCES, DIAGNOSED_ROWS)
     latents = still(
