@@ -146,3 +146,29 @@ def test_a_trained_policy_plays_on_with_workers_and_without(tmp_path):
     ]
     jax.tree.map(np.testing.assert_array_equal, *played)
     assert len(played[0].score) == 10
+
+
+def test_memories_of_a_run_are_those_of_its_newest_parameters(tmp_path):
+    """QMIX's memory draws nothing; its sequences of 8 rows reach back to every reset."""
+    config = config_of("qmix", tmp_path, total_steps=230)
+    (folder,) = train(config).folders
+    training = programs(config).training
+    shape = jax.eval_shape(training.init, jax.random.key(0))
+    state = Checkpoints(folder / "checkpoints").restore("state", shape)[1]
+    executor, compared = training.executor(state.learner), 0
+    for lane in range(2):
+        size = int(state.replay.size[lane])
+        newest = jax.tree.map(lambda x, lane=lane: x[lane], state.collectors.row)
+        assert np.array_equal(newest.obs, state.replay.rows.obs[lane, size - 1])
+        episode = int(newest.obs[0, 0])  # rows since the reset
+        memory = executor.initial(newest)
+        for t in range(size - 1 - episode, size - 1):
+            row = jax.tree.map(lambda x, lane=lane, t=t: x[lane, t], state.replay.rows)
+            assert row.is_first == (t == size - 1 - episode)
+            memory, _ = executor.act(memory, row, jax.random.key(0))
+        if episode:
+            kept = state.collectors.memory[lane]
+            assert np.abs(kept).max() > 0
+            np.testing.assert_allclose(kept, memory, atol=1e-5)
+            compared += 1
+    assert compared
