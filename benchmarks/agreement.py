@@ -25,8 +25,8 @@ from mabl.world_models.sequences import observe_sequence
 
 SEQUENCES = 64
 STATES = 192
-ACTIONS = 8
-"""Joint actions in each state: each is drawn by the policy or uniformly, with equal chances."""
+BY_POLICY, UNIFORM = 8, 4
+"""Joint actions in each state that the policy draws, and that are drawn uniformly."""
 DRAWS = 8
 """Trajectories of either world that an action's value averages over."""
 STEPS = (1, 5)
@@ -45,6 +45,9 @@ def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:
 
     - `action_correlation_k` between model and simulator; `action_ceiling_k` between two halves of
       the simulator's own trajectories, which a perfect model would have;
+    - `policy_action_correlation_k` and `policy_action_ceiling_k`, the same of the policy's own
+      actions alone, between which it has yet to choose: the others are mostly easy to tell from
+      them;
     - `action_reward_correlation_k` of the rewards alone, `action_value_correlation_k` of V alone;
     - `action_std_k` and `action_std_model_k`, standard deviations over the actions of a state;
     - `action_value_bias_k`, the mean by which V is higher in the model, in scaled rewards.
@@ -69,9 +72,11 @@ def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:
     metrics = {}
     for i, k in enumerate(STEPS):
         true, again, said = (values[:, :, world, :, i] for world in range(3))
+        for prefix, those in (("action", slice(None)), ("policy_action", slice(BY_POLICY))):
+            one, other, model = (x[:, those].sum(-1) for x in (true, again, said))
+            metrics[f"{prefix}_correlation_{k}"] = within_states(one, model)
+            metrics[f"{prefix}_ceiling_{k}"] = within_states(one, other)
         metrics |= {
-            f"action_correlation_{k}": within_states(true.sum(-1), said.sum(-1)),
-            f"action_ceiling_{k}": within_states(true.sum(-1), again.sum(-1)),
             f"action_reward_correlation_{k}": within_states(true[..., 0], said[..., 0]),
             f"action_value_correlation_{k}": within_states(true[..., 1], said[..., 1]),
             f"action_std_{k}": true.sum(-1).std(1).mean(),
@@ -86,7 +91,8 @@ def action_values(
 ) -> Float[Array, "A 3 2 K"]:
     """Mean rewards and discounted values after some joint actions and `STEPS` steps.
 
-    By the simulator, by the simulator again, and by the model.
+    By the simulator, by the simulator again, and by the model. The first `BY_POLICY` actions are
+    the policy's.
     """
     algorithm = oracle.algorithm
     dream, space = algorithm.dream(learner), algorithm.spec.action_space
@@ -118,11 +124,10 @@ def action_values(
         gamma = algorithm.config.mappo.gamma
         return jax.vmap(lambda key: returns(step, act, start, action, gamma, key))(keys).mean(0)
 
-    def one(key: PRNGKey) -> Float[Array, "3 2 K"]:
-        key_policy, key_uniform, key_which, *keys = jax.random.split(key, 6)
-        action = act((None, now), key_policy)
+    def one(key: PRNGKey, by_policy: Array) -> Float[Array, "3 2 K"]:
+        key_policy, key_uniform, *keys = jax.random.split(key, 5)
         uniform = uniform_action(space, row.available, key_uniform)
-        action = jnp.where(jax.random.bernoulli(key_which), action, uniform)
+        action = jnp.where(by_policy, act((None, now), key_policy), uniform)
         worlds = (simulate, env_state), (simulate, env_state), (imagine, None)
         return jnp.stack(
             [
@@ -131,7 +136,8 @@ def action_values(
             ]
         )
 
-    return jax.vmap(one)(jax.random.split(key, ACTIONS))
+    n_actions = BY_POLICY + UNIFORM
+    return jax.vmap(one)(jax.random.split(key, n_actions), jnp.arange(n_actions) < BY_POLICY)
 
 
 def returns(
