@@ -36,8 +36,11 @@ class Learner(NamedTuple):
     """All that learning changes."""
 
     model: WorldModel
+    """Acts and imagines."""
     model_opt: optax.OptState
     behaviour: Any
+    trained: WorldModel | None = None
+    """Model that gradients change, where `model` is its moving average; None: `model` itself."""
 
 
 class ModelBased(NamedTuple):
@@ -82,7 +85,9 @@ class ModelBased(NamedTuple):
         shape = (self.spec.n_agents, self.spec.action_space.size)
         view = self.view(model, model.initial(), jnp.ones(shape, bool), jnp.ones(shape[0], bool))
         behaviour = self.behaviour.init(view, self.spec.action_space, key_behaviour)
-        return Learner(model, self._optimiser().init(eqx.filter(model, eqx.is_array)), behaviour)
+        opt = self._optimiser().init(eqx.filter(model, eqx.is_array))
+        trained = jax.tree.map(jnp.copy, model) if self.config.world_model.averaging else None
+        return Learner(model, opt, behaviour, trained)
 
     def policy(self, learner: Learner) -> Policy:
         """What of the learner is needed to act: all that is exported or deployed."""
@@ -91,7 +96,10 @@ class ModelBased(NamedTuple):
     def update_model(
         self, learner: Learner, experience: Experience, key: PRNGKey
     ) -> tuple[Learner, Metrics]:
-        """Draw B_M sequences and train psi on L(psi) (lines 6-7)."""
+        """Draw B_M sequences and train psi on L(psi) (lines 6-7).
+
+        With `config.world_model.averaging`, what acts and imagines is a moving average of psi.
+        """
         config = self.config.world_model
         key_sample, key_loss = jax.random.split(key)
         rows = sample_sequences(
@@ -101,13 +109,17 @@ class ModelBased(NamedTuple):
             config.batch_length,
             config.recency,
         )
-        model = with_scales(learner.model, rows)
+        model = with_scales(learner.model if learner.trained is None else learner.trained, rows)
         gradient, metrics = eqx.filter_grad(model_loss, has_aux=True)(
             model, rows, key_loss, config, self.spec.action_space
         )
         step, model_opt = self._optimiser().update(gradient, learner.model_opt)
         metrics["world_model/gradient_norm"] = optax.tree.norm(gradient)
         model = eqx.apply_updates(model, step)
+        if learner.trained is not None:
+            rate = 1 - config.averaging
+            learner = learner._replace(trained=model)
+            model = jax.tree.map(lambda old, new: old + rate * (new - old), learner.model, model)
         return learner._replace(model=model, model_opt=model_opt), metrics
 
     def update_policy(

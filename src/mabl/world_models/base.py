@@ -77,6 +77,9 @@ class WorldModelConfig:
     """Adam's learning rate (Table 4)."""
     grad_clip: float = 100.0
     """Largest global norm of the gradient."""
+    averaging: float = 0.0
+    """Decay, by model update, of a moving average of the parameters with which agents act and
+    imagine; 0 takes the newest parameters, as in the paper."""
     batch_size: int = 40
     """Sequences in a model update."""
     recency: float = 1.0
@@ -95,6 +98,7 @@ class WorldModelConfig:
         require_positive(self, "learning_rate", "grad_clip")
         require_between(self, 2, inf, "batch_length")
         require_between(self, 1, inf, "recency")
+        require_between(self, 0, 0.9999, "averaging")
         require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
         require_between(self, 0, inf, "free_nats", "obs_weight", "overshooting")
         require_between(self, 0, inf, "reward_weight", "agent_reward_weight", "end_weight")
