@@ -44,8 +44,9 @@ def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:
     after a are the policy's. Returns for each k of `STEPS`
 
     - `action_correlation_k` between model and simulator; `action_ceiling_k` between two halves of
-      the simulator's own trajectories, which a perfect model would have;
-    - `policy_action_correlation_k` and `policy_action_ceiling_k`, the same of the policy's own
+      the simulator's own trajectories, which a perfect model would have, and `action_repeat_k`
+      between two halves of the model's, which is low where imagination is noisy;
+    - `policy_action_correlation_k`, `_ceiling_k` and `_repeat_k`, the same of the policy's own
       actions alone, between which it has yet to choose: the others are mostly easy to tell from
       them;
     - `action_reward_correlation_k` of the rewards alone, `action_value_correlation_k` of V alone;
@@ -71,11 +72,12 @@ def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:
     values = jax.lax.map(lambda at: action_values(oracle, learner, *at), (*chosen, keys))
     metrics = {}
     for i, k in enumerate(STEPS):
-        true, again, said = (values[:, :, world, :, i] for world in range(3))
+        true, again, said, repeated = (values[:, :, world, :, i] for world in range(4))
         for prefix, those in (("action", slice(None)), ("policy_action", slice(BY_POLICY))):
-            one, other, model = (x[:, those].sum(-1) for x in (true, again, said))
+            one, other, model, same = (x[:, those].sum(-1) for x in (true, again, said, repeated))
             metrics[f"{prefix}_correlation_{k}"] = within_states(one, model)
             metrics[f"{prefix}_ceiling_{k}"] = within_states(one, other)
+            metrics[f"{prefix}_repeat_{k}"] = within_states(model, same)
         metrics |= {
             f"action_reward_correlation_{k}": within_states(true[..., 0], said[..., 0]),
             f"action_value_correlation_{k}": within_states(true[..., 1], said[..., 1]),
@@ -88,11 +90,11 @@ def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:
 
 def action_values(
     oracle: Any, learner: Any, env_state: Any, row: Any, latent: Any, key: PRNGKey
-) -> Float[Array, "A 3 2 K"]:
+) -> Float[Array, "A 4 2 K"]:
     """Mean rewards and discounted values after some joint actions and `STEPS` steps.
 
-    By the simulator, by the simulator again, and by the model. The first `BY_POLICY` actions are
-    the policy's.
+    By the simulator, by it again, by the model, and by it again. The first `BY_POLICY` actions
+    are the policy's.
     """
     algorithm = oracle.algorithm
     dream, space = algorithm.dream(learner), algorithm.spec.action_space
@@ -124,11 +126,11 @@ def action_values(
         gamma = algorithm.config.mappo.gamma
         return jax.vmap(lambda key: returns(step, act, start, action, gamma, key))(keys).mean(0)
 
-    def one(key: PRNGKey, by_policy: Array) -> Float[Array, "3 2 K"]:
-        key_policy, key_uniform, *keys = jax.random.split(key, 5)
+    def one(key: PRNGKey, by_policy: Array) -> Float[Array, "4 2 K"]:
+        key_policy, key_uniform, *keys = jax.random.split(key, 6)
         uniform = uniform_action(space, row.available, key_uniform)
         action = jnp.where(by_policy, act((None, now), key_policy), uniform)
-        worlds = (simulate, env_state), (simulate, env_state), (imagine, None)
+        worlds = [(simulate, env_state)] * 2 + [(imagine, None)] * 2
         return jnp.stack(
             [
                 mean_of_draws(step, (start, now), action, key)

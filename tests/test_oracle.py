@@ -221,7 +221,7 @@ def test_the_simulators_side_of_agreement_follows_the_rules_of_the_task(algo):
             )
         )(begun.env_state, begun.row, keys)
 
-    found = np.asarray(values(jax.random.key(0)))  # [2 lanes of rows 0 to 3, A, 3, 2, K]
+    found = np.asarray(values(jax.random.key(0)))  # [2 lanes of rows 0 to 3, A, 4, 2, K]
     gamma, left = algorithm.config.mappo.gamma, np.tile(np.arange(4, 0, -1), 2)[:, None]
     for world in (0, 1):
         (paid, paid_5), (worth, worth_5) = np.moveaxis(found[:, :, world], (2, 3), (0, 1))
@@ -233,6 +233,7 @@ def test_the_simulators_side_of_agreement_follows_the_rules_of_the_task(algo):
         assert (later >= -1e-4).all() and (later <= bound + 1e-4).all()
         assert later[left[:, 0] > 1].mean() > 0.1 * SCALE
     (said, _), (promised, _) = np.moveaxis(found[:, :, 2], (2, 3), (0, 1))
+    assert not np.array_equal(found[:, :, 2], found[:, :, 3])
     assert not np.allclose(said, paid, atol=0.5)
     assert (promised > 0).all() and (promised < gamma * 7.0).all()
 
