@@ -92,5 +92,5 @@ def test_agents_act_and_imagine_with_the_average(learned):
 
 def test_an_average_that_never_moves_is_refused():
     config = tiny("mabl")
-    with pytest.raises(UserError, match="--world-model.averaging is 1: give a number from 0 to"):
+    with pytest.raises(UserError, match=r"--world-model\.averaging is 1: give a number from 0 to"):
         replace(config.world_model, averaging=1)
