@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mabl.envs.base import Continuous, Discrete, EnvSpec
 from mabl.losses.kl import balanced_kl
-from mabl.nets.categorical import Code, CodeShape
+from mabl.nets.categorical import Code, CodeShape, still
 from mabl.nets.mlp import MLP, dense
 from mabl.rows import TimeStep
 from mabl.world_models.base import WorldModelConfig
@@ -248,7 +248,25 @@ def test_agent_prior_input_posterior_takes_the_posterior_sample_instead():
     assert not np.allclose(model.prior(moved, jax.random.key(0))[1]["agent"], one["agent"])
 
 
-def test_priors_do_not_see_the_row_they_predict(model):
+@pytest.mark.parametrize("sees", ["sample", "level"])
+def test_an_agent_prior_that_sees_the_level_knows_the_joint_action(sees):
+    """h^g is a function of it, h^a of the agent's own action alone."""
+    model = build(agent_prior_sees=sees)
+    start = still(jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0]))
+    one = jnp.eye(3)
+    other = one.at[2].set(one[0])  # the third agent plays otherwise
+    levels = [model.imagine(start, action, jax.random.key(0)) for action in (one, other)]
+    assert_array_equal(levels[0].agent.h[0], levels[1].agent.h[0])
+    z = levels[0].global_.z  # the same sample after both
+    first, second = (
+        jax.vmap(model.nets.agent_logits)(x.agent.h, x.global_._replace(z=z))[0] for x in levels
+    )
+    assert np.allclose(first, second) == (sees == "sample")
+
+
+@pytest.mark.parametrize("sees", ["sample", "level"])
+def test_priors_do_not_see_the_row_they_predict(sees):
+    model = build(agent_prior_sees=sees)
     # The row's own z is not an input of either prior: only h, which precedes it.
     latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
     moved = latent._replace(agent=mirrored(latent.agent))

@@ -487,6 +487,15 @@ def test_sgs_agents_priors_see_the_teams_sample():
     assert_allclose(prior(h, seen.latents.global_.z), seen.prior["agent"], rtol=1e-5, atol=1e-6)
 
 
+def test_sgs_agents_priors_may_see_the_teams_level():
+    model = build("mabl-sg", agent_prior_sees="level")
+    seen = observed(model, some_rows(4))
+    prior = on_host(jax.vmap(jax.vmap(model.nets.agent_logits, in_axes=(0, None))))
+    h, team = seen.latents.agent.h, seen.prior_latents.global_
+    assert_allclose(prior(h, team), seen.prior["agent"], rtol=1e-5, atol=1e-6)
+    assert differ(prior(h, team._replace(h=-team.h)), seen.prior["agent"])
+
+
 def test_sgs_imagined_agents_follow_the_one_imagined_global_state():
     # Rig the agents' prior to copy the global sample, for certain.
     model = build("mabl-sg")

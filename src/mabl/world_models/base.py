@@ -33,6 +33,9 @@ class WorldModelConfig:
     agent_prior_input: Literal["prior", "posterior"] = "prior"
     """Global sample behind the agent prior in training (sec. 3.2: prior, app. A: posterior);
     models of one level have none."""
+    agent_prior_sees: Literal["sample", "level"] = "sample"
+    """Input of the agent prior beside h_agent, where there are two levels: z_global as in the
+    paper, or the whole level (z_global, h_global), which knows the joint action (ADR 23)."""
     activation: Activation = "relu"
     """Hidden layers of all networks: `relu` as in the paper (appendix B.1), or `rms_silu`: RMS
     normalisation and SiLU, as in DreamerV3."""

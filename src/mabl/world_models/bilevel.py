@@ -51,6 +51,7 @@ class BiLevel(eqx.Module):
     global_prior: Categoricals
     agent_prior: Categoricals
     heads: Heads
+    agent_prior_sees: str = eqx.field(static=True)
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, n_seen: int, key: PRNGKey):
         """The global posterior sees the z_agent of `n_seen` agents."""
@@ -69,7 +70,9 @@ class BiLevel(eqx.Module):
             (hidden, seen, hidden), hidden, latent, keys[3], activation
         )
         self.global_prior = Categoricals((hidden,), hidden, latent, keys[4], activation)
-        self.agent_prior = Categoricals((hidden, latent), hidden, latent, keys[5], activation)
+        above = (latent, hidden) if config.agent_prior_sees == "level" else (latent,)
+        self.agent_prior = Categoricals((hidden, *above), hidden, latent, keys[5], activation)
+        self.agent_prior_sees = config.agent_prior_sees
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, latent, hidden, hidden),
@@ -82,6 +85,11 @@ class BiLevel(eqx.Module):
             key=keys[6],
             activation=activation,
         )
+
+    def agent_logits(self, h: Float[Array, " D"], global_: Level) -> Float[Array, "K C"]:
+        """Logits of one agent's prior: of p(z^a | h^a, z^g), or of p(z^a | h^a, z^g, h^g)."""
+        above = global_.features() if self.agent_prior_sees == "level" else (global_.z,)
+        return self.agent_prior(h, *above)
 
     def predict(self, agent: Level, full: Features) -> Predictions:
         """One agent's predictions of a row, in the environment's units."""

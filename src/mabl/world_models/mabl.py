@@ -89,7 +89,7 @@ class MABL(eqx.Module):
         def prior_agent(latent: Latent, key: PRNGKey) -> tuple[Latent, dict[str, Array]]:
             prior, logits = self._transition(latent.agent.h, latent.global_.h, key)
             if by_posterior:
-                logits["agent"] = self.nets.agent_prior(latent.agent.h, latent.global_.z)
+                logits["agent"] = self.nets.agent_logits(latent.agent.h, latent.global_)
             return prior, logits
 
         return jax.vmap(prior_agent)(latent, jax.random.split(key, self.spec.n_agents))
@@ -122,9 +122,10 @@ class MABL(eqx.Module):
         key_agent, key_global = jax.random.split(key)
         global_logits = self.nets.global_prior(h_global)
         sample = draw(global_logits, key_global)
-        agent_logits = self.nets.agent_prior(h_agent, sample)
+        global_ = Level(h_global, sample)
+        agent_logits = self.nets.agent_logits(h_agent, global_)
         agent = Level(h_agent, draw(agent_logits, key_agent))
-        return Latent(agent, Level(h_global, sample)), {
+        return Latent(agent, global_), {
             "agent": agent_logits,
             "global": global_logits,
         }

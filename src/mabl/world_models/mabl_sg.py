@@ -75,8 +75,8 @@ class MABLSG(eqx.Module):
         """
         prior, logits = self._transition(latent, key)
         if self.config.agent_prior_input == "posterior":
-            agent_prior = jax.vmap(self.nets.agent_prior, in_axes=(0, None))
-            logits["agent"] = agent_prior(latent.agent.h, latent.global_.z)
+            agent_logits = jax.vmap(self.nets.agent_logits, in_axes=(0, None))
+            logits["agent"] = agent_logits(latent.agent.h, latent.global_)
         return prior, logits
 
     def imagine(self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey) -> Latent:
@@ -91,8 +91,7 @@ class MABLSG(eqx.Module):
         key_agents, key_global = jax.random.split(key)
         global_logits = self.nets.global_prior(latent.global_.h)
         global_ = Level(latent.global_.h, draw(global_logits, key_global))
-        agent_prior = jax.vmap(self.nets.agent_prior, in_axes=(0, None))
-        agent_logits = agent_prior(latent.agent.h, global_.z)
+        agent_logits = jax.vmap(self.nets.agent_logits, in_axes=(0, None))(latent.agent.h, global_)
         agent = Level(latent.agent.h, draw(agent_logits, key_agents))
         return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
 
