@@ -195,7 +195,7 @@ QUICK = _QUICK | {
 
 def _efficient(quick: Config) -> Config:
     """100 replayed rows for each environment step, where `quick` has 22; policies also see
-    the decoded observation (ADR 22)."""
+    the decoded observation (ADR 22), and a model that is averaged (ADR 23)."""
     return replace(
         quick,
         preset="efficient",
@@ -206,6 +206,9 @@ def _efficient(quick: Config) -> Config:
             standardise=True,
             activation="rms_silu",
             policy_input="decoded",
+            agent_prior_sees="level",
+            averaging=0.99,
+            kl_weight=0.5,
             learning_rate=2e-3,
         ),
     )
