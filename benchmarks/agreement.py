@@ -1,9 +1,8 @@
 """Compare how the world model and the simulator rank joint actions.
 
-For some replayed states and several joint actions in each, some steps are taken in the model and in
-the simulator, after the first by the policy; the critic values what either leads to. Policies learn
-from differences between the actions of a state, so that their correlation within states says how
-well imagination teaches.
+Takes a joint action in a replayed state and then follows the policy, in the model and in the
+simulator, and compares the values of what they lead to. Policies learn from differences between the
+actions of a state, so that their correlation within states says how well imagination teaches.
 """
 
 from collections.abc import Callable
@@ -43,15 +42,15 @@ def agreement(oracle: Any, state: Any, key: PRNGKey) -> Metrics:
     Of action a at row t it is the mean of r_{t+1} + ... + gamma^k V(row t + k), where the actions
     after a are the policy's. Returns for each k of `STEPS`
 
-    - `action_correlation_k` between model and simulator; `action_ceiling_k` between two halves of
-      the simulator's own trajectories, which a perfect model would have, and `action_repeat_k`
-      between two halves of the model's, which is low where imagination is noisy;
+    - `action_correlation_k` between model and simulator; `action_ceiling_k` between two estimates
+      of the simulator, the highest that a model can have, and `action_repeat_k` between two of the
+      model, which is low where imagination is noisy;
     - `policy_action_correlation_k`, `_ceiling_k` and `_repeat_k`, the same of the policy's own
-      actions alone, between which it has yet to choose: the others are mostly easy to tell from
-      them;
-    - `action_reward_correlation_k` of the rewards alone, `action_value_correlation_k` of V alone;
+      actions alone, between which it has yet to choose; they fall with its entropy, as actions
+      drawn twice differ by noise alone;
+    - `action_reward_correlation_k` of the rewards alone, `action_value_correlation_k` of gamma^k V;
     - `action_std_k` and `action_std_model_k`, standard deviations over the actions of a state;
-    - `action_value_bias_k`, the mean by which V is higher in the model, in scaled rewards.
+    - `action_value_bias_k`, the mean by which gamma^k V is higher in the model, in scaled rewards.
     """
     learner = state.learner
     key_sample, key_observe, key_choose, key_act = jax.random.split(key, 4)
@@ -93,8 +92,8 @@ def action_values(
 ) -> Float[Array, "A 4 2 K"]:
     """Mean rewards and discounted values after some joint actions and `STEPS` steps.
 
-    By the simulator, by it again, by the model, and by it again. The first `BY_POLICY` actions
-    are the policy's.
+    Axis 1 holds two independent estimates of the simulator, then two of the model. The first
+    `BY_POLICY` actions are the policy's.
     """
     algorithm = oracle.algorithm
     dream, space = algorithm.dream(learner), algorithm.spec.action_space

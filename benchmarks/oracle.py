@@ -129,10 +129,10 @@ class Oracle(NamedTuple):
 
     def init(self, key: PRNGKey) -> TrainState:
         plan = self.algorithm.config.training
-        key, key_learner, key_behaviour, key_envs = jax.random.split(key, 4)
+        key, key_learner, key_behaviour, key_envs, key_shape = jax.random.split(key, 5)
         learner = self.algorithm.init(key_learner)
         if self.parts.inputs == "observations":
-            row = self.env.reset(key_envs)[1]
+            row = self.env.reset(key_shape)[1]
             space = self.algorithm.spec.action_space
             behaviour = self.algorithm.behaviour.init(
                 self._view(learner, row), space, key_behaviour

@@ -17,6 +17,7 @@ from tests.tiny import flags, tiny
 from mabl.algorithms.base import Experience
 from mabl.behaviour.mappo import MAPPO
 from mabl.nets.categorical import still
+from mabl.training.loop import cycle_keys
 from mabl.training.programs import build
 
 SCALE = 10.0
@@ -107,7 +108,7 @@ def test_with_everything_learned_it_is_plain_training():
         after, _ = oracle.cycle(state, 0, 1, 1000)
         rows = after.replay._replace(rows=after.replay.rows.row)
         experience = Experience(rows, None, None, state.env_steps / 1000)
-        key_policy = jax.random.fold_in(jax.random.split(state.key, 4)[3], 0)
+        key_policy = jax.random.fold_in(cycle_keys(state.key).policy, 0)
         plain, _ = training.algorithm.update_policy(state.learner, experience, key_policy)
         return after.learner, plain, oracle.diagnose(after)
 
@@ -239,23 +240,20 @@ def test_the_simulators_side_of_agreement_follows_the_rules_of_the_task(algo):
 
 
 def test_returns_of_a_trajectory_by_hand():
-    """Rewards 1, 2, ..; goes on with .5 each time; V of state n is 100 n; gamma .8.
+    """Rewards are action + state, with actions 3, then 1; goes on with .5; V of state n is 100 n.
 
-    After one step: 1 and .8 (.5) 100. After five: sum of .4^i (i + 1), and .4^5 500. The step sees
-    the first action, then the policy's.
+    With gamma .8, after one step: 3 and .8 (.5) 100. After five: 3 and the sum of .4^i (1 + i) from
+    i = 1, and .4^5 500.
     """
-    seen = []
 
     def step(state, action, key):
         del key
-        seen.append(action)
         return state + 1, action + state, jnp.float32(0.5), 100.0 * (state + 1)
 
     def act(state, key):
         del state, key
         return jnp.float32(1.0)
 
-    with jax.disable_jit():
-        found = returns(step, act, jnp.float32(0), jnp.float32(1.0), 0.8, jax.random.key(0))
-    rewards = [1.0, sum(0.4**i * (i + 1) for i in range(5))]
+    found = returns(step, act, jnp.float32(0), jnp.float32(3.0), 0.8, jax.random.key(0))
+    rewards = [3.0, 3.0 + sum(0.4**i * (1 + i) for i in range(1, 5))]
     assert_allclose(found, [rewards, [0.4 * 100, 0.4**5 * 500]], rtol=1e-6)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
@@ -55,6 +56,13 @@ def leaves_of(tree):
     return [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.inexact)]
 
 
+def without_scales(learner):
+    def strip(model):
+        return eqx.tree_at(lambda m: (m.nets.filter.scale, m.nets.state_scale), model, (None, None))
+
+    return learner._replace(model=strip(learner.model), trained=strip(learner.trained))
+
+
 def test_gradients_are_those_of_the_trained_model(learned):
     """It goes the same way whether it is averaged or not."""
     _, plain, *_ = learned[0.0]
@@ -66,8 +74,22 @@ def test_gradients_are_those_of_the_trained_model(learned):
 
 
 def test_the_average_by_hand(learned):
-    """After n updates: d^n of the first parameters, and (1 - d) d^(n - i) of those after i."""
+    """After n updates: d^n of the first parameters, and (1 - d) d^(n - i) of those after i.
+
+    Scales of inputs, which begin with no weight, are the newest.
+    """
     _, learners, *_ = learned[DECAY]
+    newest = learners[-1]
+    for model in (newest.model, newest.trained):
+        assert (model.filter.scale.moments()[1] > 0).any()
+    for scale in (lambda m: m.filter.scale, lambda m: m.state_scale):
+        for a, b in zip(
+            jax.tree.leaves(scale(newest.model)),
+            jax.tree.leaves(scale(newest.trained)),
+            strict=True,
+        ):
+            assert_array_equal(a, b)
+    learners = [without_scales(learner) for learner in learners]
     weights = [DECAY**UPDATES] + [(1 - DECAY) * DECAY ** (UPDATES - i) for i in (1, 2, 3)]
     history = [leaves_of(learner.trained) for learner in learners]
     moved = 0

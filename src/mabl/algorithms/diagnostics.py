@@ -89,8 +89,8 @@ def value_metrics(
 
     `behaviour/value_gap` is the mean of V(prior latent) - V(posterior latent) of the same row, the
     prior's drawn one step ahead with the real action. Above 0, the critic promises more of
-    imagination than of the world. The first `WARM_UP` rows of a sequence, whose past the latent
-    does not know, do not count unless they follow a reset in it. Both metrics are in the
+    imagination than of the world. A row counts if the one before has `WARM_UP` rows of the
+    sequence, or a reset, before it: else the latent does not know its past. Both metrics are in the
     environment's units.
     """
 

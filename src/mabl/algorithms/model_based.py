@@ -20,6 +20,7 @@ from mabl.envs.base import EnvSpec
 from mabl.execution import Policy
 from mabl.imagination import Dream, Imagined, Step, imagine_trajectory
 from mabl.nets.categorical import still
+from mabl.nets.normaliser import Normaliser
 from mabl.nets.optimiser import guarded
 from mabl.replay import Replay, sample_sequences
 from mabl.rows import TimeStep, is_last
@@ -40,7 +41,7 @@ class Learner(NamedTuple):
     model_opt: optax.OptState
     behaviour: Any
     trained: WorldModel | None = None
-    """Model that gradients change, where `model` is its moving average; None: `model` itself."""
+    """Newest parameters, which gradients change; None without averaging, where `model` has them."""
 
 
 class ModelBased(NamedTuple):
@@ -117,9 +118,8 @@ class ModelBased(NamedTuple):
         metrics["world_model/gradient_norm"] = optax.tree.norm(gradient)
         model = eqx.apply_updates(model, step)
         if learner.trained is not None:
-            rate = 1 - config.averaging
             learner = learner._replace(trained=model)
-            model = jax.tree.map(lambda old, new: old + rate * (new - old), learner.model, model)
+            model = averaged(learner.model, model, 1 - config.averaging)
         return learner._replace(model=model, model_opt=model_opt), metrics
 
     def update_policy(
@@ -255,3 +255,20 @@ def starts(
         return jax.tree.map(lambda x: x[order], (states, weight))
     order = jnp.argsort(jax.random.uniform(key, weight.shape) - 2 * weight)[:n_starts]
     return jax.tree.map(lambda x: x[order], (states, weight))
+
+
+def averaged(average: WorldModel, newest: WorldModel, rate: float) -> WorldModel:
+    """Move an average `rate` of the way to the newest parameters.
+
+    Scales of inputs, which are running means already, are the newest.
+    """
+
+    def is_scale(node: Any) -> bool:
+        return isinstance(node, Normaliser)
+
+    return jax.tree.map(
+        lambda old, new: new if is_scale(new) else old + rate * (new - old),
+        average,
+        newest,
+        is_leaf=is_scale,
+    )

@@ -194,8 +194,8 @@ QUICK = _QUICK | {
 
 
 def _efficient(quick: Config) -> Config:
-    """100 replayed rows for each environment step, where `quick` has 22; policies also see
-    the decoded observation (ADR 22), and a model that is averaged (ADR 23)."""
+    """Replay 100 rows for each environment step (`quick`: 22), and show policies the decoded
+    observation (ADR 22); average the model, whose agent prior sees the global level (ADR 23)."""
     return replace(
         quick,
         preset="efficient",

@@ -154,6 +154,6 @@ class WorldModel(Protocol[L]):
 
 
 def with_life(model: WorldModel[L], latent: L, alive: Bool[Array, " N"]) -> L:
-    """Latent of a model that holds who lives, told so; any other model's as it is."""
+    """Set who lives in a latent that holds it, such as MAMBA's; return any other unchanged."""
     tell = getattr(model, "with_life", None)
     return latent if tell is None else tell(latent, alive)
