@@ -1,8 +1,8 @@
 """How long each part of a run takes, and how near that comes to what the machine can do.
 
-All parts run one after the other in one process. Work
-is the multiplications and additions of matrix products in the program as it is written: what an
-index saves in place of a one-hot vector is not in it.
+All parts run one after the other in one process. Work is the multiplications and additions of
+matrix products in the program as it is written: what an index saves in place of a one-hot vector is
+not in it.
 """
 
 import json
@@ -21,7 +21,6 @@ import numpy as np
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from jax.extend.core import jaxprs_in_params
 from jax.interpreters.partial_eval import dce_jaxpr
-from rich.table import Table
 
 from mabl.algorithms.base import Experience
 from mabl.algorithms.config import Config
@@ -300,77 +299,3 @@ def peak_memory() -> int:
     return stats.get("peak_bytes_in_use") or of_process * (
         1 if platform.system() == "Darwin" else 1024
     )
-
-
-def read(path: Path) -> dict[str, Any]:
-    """What `Report.write` wrote. Raises UserError for anything else."""
-    try:
-        found = json.loads(path.read_text())
-        timings = {k: v["median"] for k, v in found["timings"].items()}
-        return {
-            "subject": {**found["subject"]},
-            "machine": {**found["machine"]},
-            "timings": timings,
-        }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} is no report of mabl bench --json: {error}") from error
-
-
-def table(report: Report, baseline: dict[str, Any] | None = None) -> Table:
-    """For people; with a baseline, how many times faster each part is than it was there."""
-    made = Table(
-        box=None, title=title(report), caption=caption(report, baseline), title_justify="left"
-    )
-    made.caption_justify = "left"
-    headings = ["part", "median", "least", "greatest", "GFLOP", "GFLOP/s", "of peak", "temporary"]
-    for heading in headings + ["times as fast"] * (baseline is not None):
-        made.add_column(heading, justify="left" if heading == "part" else "right")
-    for name, timing in report.timings.items():
-        rate = timing.flop / timing.median
-        cells = [name, *(milliseconds(float(f(timing.seconds))) for f in (np.median, min, max))]
-        cells += [f"{timing.flop / 1e9:,.1f}", f"{rate / 1e9:,.0f}"] if rate else ["", ""]
-        cells.append(f"{rate / report.peak[report.subject['precision']]:.0%}" if rate else "")
-        cells.append(f"{timing.temporary / 2**20:,.0f} MiB" if timing.temporary else "")
-        if baseline is not None:
-            before = baseline["timings"].get(name)
-            cells.append(f"{before / timing.median:.2f}" if before else "-")
-        made.add_row(*cells)
-    return made
-
-
-def title(report: Report) -> str:
-    """What was run, and where."""
-    subject, on = report.subject, report.machine
-    seeds = "" if subject["num_seeds"] == 1 else f", {subject['num_seeds']} seeds"
-    devices = "" if subject["num_devices"] == 1 else f" on {subject['num_devices']} devices"
-    return (
-        f"{subject['algo']} on {subject['env']} ({subject['n_agents']} agents{seeds}), preset "
-        f"{subject['preset']}, {subject['precision']}{devices}; {on['device']}, {on['cores']} "
-        f"cores, jax {on['jax']}"
-    )
-
-
-def caption(report: Report, baseline: dict[str, Any] | None = None) -> str:
-    """What is measured once, and how what was run differs from what it is compared with."""
-    peak = ", ".join(
-        f"{kind} {rate / 1e9:,.0f} G{'B' if kind == 'copy' else 'FLOP'}/s"
-        for kind, rate in report.peak.items()
-    )
-    lines = [
-        f"peak: {peak}",
-        f"compiling, and a first collection: {report.compile_seconds:.1f} s; "
-        f"most memory: {report.memory / 2**20:,.0f} MiB",
-    ]
-    if baseline is not None:
-        ours, theirs = (
-            {k: v for of in ("subject", "machine") for k, v in found[of].items()}
-            for found in (report._asdict(), baseline)
-        )
-        changed = [f"{k} {theirs.get(k)} -> {v}" for k, v in ours.items() if theirs.get(k) != v]
-        lines.append(f"against another: {', '.join(changed) or 'the same, run before'}")
-    return "\n".join(lines)
-
-
-def milliseconds(seconds: float) -> str:
-    """Three digits."""
-    return f"{1e3 * seconds:,.{max(0, 2 - int(np.floor(np.log10(1e3 * seconds))))}f} ms"

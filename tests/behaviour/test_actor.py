@@ -13,7 +13,7 @@ from mabl.behaviour.actor import (
     MaskedCategorical,
     actor_for,
 )
-from mabl.behaviour.mappo import PPORows, policy_loss
+from mabl.behaviour.ppo import PPORows, policy_loss
 from mabl.envs.base import Continuous, Discrete
 from mabl.types import TeamView
 

@@ -10,14 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mabl.behaviour.actor import MaskedCategorical, has_choice
 from mabl.behaviour.base import annealed, divided, minibatch_steps, minibatches
-from mabl.behaviour.mappo import (
-    MAPPO,
-    MAPPOConfig,
-    PPORows,
-    experience,
-    kl_of_choices,
-    policy_loss,
-)
+from mabl.behaviour.mappo import MAPPO, MAPPOConfig, experience
+from mabl.behaviour.ppo import PPORows, kl_of_choices, policy_loss
 from mabl.envs.base import Discrete
 from mabl.rows import TimeStep
 from mabl.types import Replayed, TeamView, Trajectory

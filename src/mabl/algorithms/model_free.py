@@ -15,7 +15,7 @@ from mabl.algorithms.config import Config
 from mabl.behaviour.actor import actor_for
 from mabl.behaviour.base import minibatch_of, minibatch_steps, minibatches
 from mabl.behaviour.critic import Critic
-from mabl.behaviour.mappo import PPORows, real_returns, weighted_mean
+from mabl.behaviour.ppo import PPORows, real_returns, weighted_mean
 from mabl.behaviour.recurrent import (
     Chunks,
     RecurrentFilter,

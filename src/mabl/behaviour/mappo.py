@@ -12,7 +12,7 @@ import optax
 from einops import rearrange
 from jaxtyping import Array, Float
 
-from mabl.behaviour.actor import Actor, Choice, ContinuousActor, actor_for, has_choice
+from mabl.behaviour.actor import Actor, ContinuousActor, actor_for, has_choice
 from mabl.behaviour.base import (
     ActorFunction,
     annealed,
@@ -22,14 +22,20 @@ from mabl.behaviour.base import (
     minibatches,
 )
 from mabl.behaviour.critic import Critic
+from mabl.behaviour.ppo import (
+    PPORows,
+    kl_of_choices,
+    policy_loss,
+    real_returns,
+    shared_reward,
+    weighted_mean,
+)
 from mabl.envs.base import ActionSpace
 from mabl.errors import UserError, require_between, require_positive
-from mabl.losses.ppo import clipped_surrogate
-from mabl.losses.returns import lambda_returns, returns_across_resets
+from mabl.losses.returns import lambda_returns
 from mabl.nets.mlp import Features, widths_of
 from mabl.nets.normaliser import Normaliser
 from mabl.nets.optimiser import guarded
-from mabl.rows import TimeStep
 from mabl.types import Metrics, PRNGKey, Progress, Replayed, TeamView, Trajectory
 
 
@@ -131,20 +137,6 @@ class ActorCritic(NamedTuple):
     def value(self, features: Features) -> Float[Array, " N"]:
         """The critic's, in the rewards' units."""
         return self.returns.restore(self.critic(features))
-
-
-class PPORows(NamedTuple):
-    """Joint rows of imagined experience, `[M, N, ...]`, as PPO's epochs see them."""
-
-    view: TeamView
-    action: Array
-    log_prob: Array
-    advantage: Array
-    target: Array
-    weight: Array
-    """Weight of a row in the policy's loss."""
-    value_weight: Array
-    """Weight of a row in the critic's loss."""
 
 
 class ValueRows(NamedTuple):
@@ -278,13 +270,6 @@ def experience(
     return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
 
 
-def shared_reward(reward: Float[Array, "*b N"], team_reward: bool) -> Float[Array, "*b N"]:
-    """The team's mean reward for every agent, or to each its own."""
-    if not team_reward:
-        return reward
-    return jnp.broadcast_to(reward.mean(-1, keepdims=True), reward.shape)
-
-
 def replayed_values(critic: ValueFunction, replayed: Replayed, config: MAPPOConfig) -> ValueRows:
     """Lambda-returns along one real sequence `[T, ...]`, whoever acted in it (ADR 8)."""
     view, rows = replayed
@@ -293,65 +278,12 @@ def replayed_values(critic: ValueFunction, replayed: Replayed, config: MAPPOConf
     return ValueRows(jax.tree.map(lambda x: x[:-1], view), target, weight)
 
 
-def real_returns(
-    value: Float[Array, "T N"],
-    rows: TimeStep,
-    gamma: float,
-    gae_lambda: float,
-    team_reward: bool,
-) -> tuple[Float[Array, "T-1 N"], Float[Array, "T-1 N"]]:
-    """Lambda-returns of one real sequence's rows but the last, and how much they count.
-
-    From an episode's last row to the next reset nothing passes: that step weighs nothing and hands
-    back the last row's value, so that truncated episodes bootstrap.
-    """
-    ends = jnp.broadcast_to(rows.is_first[1:, None], value[1:].shape)
-    target = returns_across_resets(
-        value,
-        shared_reward(rows.reward[1:], team_reward),
-        rows.terminated[1:],
-        ends,
-        gamma,
-        gae_lambda,
-    )
-    return target, 1.0 - ends
-
-
-def weighted_mean(values: Float[Array, "*b"], weight: Float[Array, "*b"]) -> Float[Array, ""]:
-    """Mean of what counts; 0 where nothing does."""
-    return (weight * values).sum() / (weight.sum() + 1e-8)
-
-
 def actor_loss(
     actor: ActorFunction, rows: PPORows, ent_coef: Float[Array, ""], clip: float
 ) -> tuple[Float[Array, ""], Metrics]:
     """PPO's loss of the policy that an actor has at `rows`."""
     policy = jax.vmap(jax.vmap(actor))(rows.view.actor_features, rows.view.available)
     return policy_loss(policy, rows, ent_coef, clip)
-
-
-def policy_loss(
-    policy: Choice, rows: PPORows, ent_coef: Float[Array, ""], clip: float
-) -> tuple[Float[Array, ""], Metrics]:
-    """PPO's clipped surrogate minus the entropy bonus.
-
-    Rows of the dead, and rows without a choice, do not count.
-    """
-    weight = rows.weight * rows.view.alive * policy.free(rows.view.available)
-    # What does not count may be no choice at all, whose ratio must not overflow.
-    log_prob = jnp.where(weight > 0, policy.log_prob(rows.action), rows.log_prob)
-    surrogate = clipped_surrogate(log_prob, rows.log_prob, rows.advantage, clip)
-    entropy = weighted_mean(policy.entropy(), weight)
-    loss = weighted_mean(surrogate, weight) - ent_coef * entropy
-    ratio = jnp.exp(log_prob - rows.log_prob)
-    share = policy.entropy() / jnp.maximum(policy.most_entropy(rows.view.available), 1e-6)
-    return loss, {
-        "behaviour/actor_loss": loss,
-        "behaviour/entropy": entropy,
-        "behaviour/entropy_share": weighted_mean(share, weight),
-        "behaviour/clip_fraction": weighted_mean(1.0 * (jnp.abs(ratio - 1) > clip), weight),
-        "behaviour/approx_kl": weighted_mean(rows.log_prob - log_prob, weight),
-    }
 
 
 def critic_loss(
@@ -434,14 +366,3 @@ def update_kl(actor: ActorFunction, rows: PPORows) -> Float[Array, ""]:
     """KL(old || new) on `rows`, whose actions the old policy drew."""
     policy = jax.vmap(jax.vmap(actor))(rows.view.actor_features, rows.view.available)
     return kl_of_choices(policy, rows)
-
-
-def kl_of_choices(policy: Choice, rows: PPORows) -> Float[Array, ""]:
-    """Estimate of KL(old || new) from actions of the old policy: E_old[r - 1 - log r].
-
-    Rows of the dead, and rows without a choice, do not count [J. Schulman, "Approximating KL
-    divergence", 2020].
-    """
-    weight = rows.weight * rows.view.alive * policy.free(rows.view.available)
-    log_ratio = jnp.where(weight > 0, policy.log_prob(rows.action) - rows.log_prob, 0.0)
-    return weighted_mean(jnp.expm1(log_ratio) - log_ratio, weight)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.behaviour.actor import Choice
 from mabl.behaviour.base import ActorFunction
-from mabl.behaviour.mappo import PPORows, kl_of_choices, policy_loss, weighted_mean
+from mabl.behaviour.ppo import PPORows, kl_of_choices, policy_loss, weighted_mean
 from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.gru import GRU
 from mabl.nets.mlp import Linear

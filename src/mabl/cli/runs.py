@@ -110,12 +110,13 @@ def bench(arguments: list[str]) -> int:
     if given.json and given.json.is_dir():
         raise UserError(f"--json {given.json} is a folder: give a file")
     from mabl import bench as benchmark
+    from mabl import bench_table
 
-    baseline = benchmark.read(given.against) if given.against else None
+    baseline = bench_table.read(given.against) if given.against else None
     console = Console(stderr=True)
     with console.status("starting") as status:
         report = benchmark.measure(config, given.repeats, given.parts, status.update)
-    print_table(benchmark.table(report, baseline))
+    print_table(bench_table.table(report, baseline))
     if given.json:
         report.write(given.json)
     return 0
