@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from benchmarks import agreement as comparison
 from benchmarks import oracle as instrument
 from benchmarks import oracle_table
 from benchmarks.agreement import action_values, returns, within_states
@@ -194,6 +195,39 @@ def test_agreement_is_the_correlation_within_states_by_hand():
     b = jnp.array([[5.0, 7.0], [3.0, -1.0]])
     assert_allclose(within_states(a, b), -0.6, rtol=1e-6)
     assert_allclose(within_states(a, 3 * a + jnp.array([[7.0], [-50.0]])), 1.0, rtol=1e-6)
+
+
+def test_agreement_compares_the_right_worlds_and_actions(monkeypatch):
+    """The model ranks the policy's actions the other way round, the others like the simulator.
+
+    Estimates differ by factors and by what each state adds, which no correlation sees.
+    """
+
+    def values(oracle, learner, env_state, row, latent, key):
+        n_actions = comparison.BY_POLICY + comparison.UNIFORM
+        x = jax.random.normal(key, (n_actions, 2, len(comparison.STEPS)))
+        turned = jnp.where(jnp.arange(n_actions) < comparison.BY_POLICY, -1.0, 1.0)
+        said = x * turned[:, None, None]
+        return jnp.stack([x, 2 * x + 5, 3 * said, 4 * said - 7], 1)
+
+    monkeypatch.setattr(comparison, "action_values", values)
+    training = build(tiny("mabl"))
+    oracle = Oracle(training.env, training.algorithm, Parts("latents", *3 * ("learned",)))
+
+    @jax.jit
+    def run(key):
+        state = oracle.init(key)
+        for _ in range(3):
+            state, _ = oracle.cycle(state, 0, 0, 1000)
+        return comparison.agreement(oracle, state, jax.random.key(1))
+
+    told = jax.device_get(run(jax.random.key(0)))
+    for k in comparison.STEPS:
+        assert_allclose(told[f"policy_action_correlation_{k}"], -1, rtol=1e-5)
+        assert -0.6 < told[f"action_correlation_{k}"] < 0  # 8 of 12 turned
+        for prefix in ("action", "policy_action"):
+            assert_allclose(told[f"{prefix}_ceiling_{k}"], 1, rtol=1e-5)
+            assert_allclose(told[f"{prefix}_repeat_{k}"], 1, rtol=1e-5)
 
 
 class Seven(MAPPO):

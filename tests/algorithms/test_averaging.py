@@ -1,5 +1,6 @@
 """The model that acts and imagines may be a moving average of the one that is trained."""
 
+import shutil
 from dataclasses import replace
 
 import equinox as eqx
@@ -9,9 +10,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from tests.tiny import tiny
 
+from mabl import resume, train
 from mabl.algorithms.base import Experience
 from mabl.errors import UserError
-from mabl.training.programs import build
+from mabl.runs.checkpoint import Checkpoints
+from mabl.training.programs import build, programs
 
 DECAY, UPDATES = 0.75, 3
 
@@ -116,3 +119,30 @@ def test_an_average_that_never_moves_is_refused():
     config = tiny("mabl")
     with pytest.raises(UserError, match=r"--world-model\.averaging is 1: give a number from 0 to"):
         replace(config.world_model, averaging=1)
+
+
+def test_a_run_with_an_average_is_resumed_bit_for_bit(tmp_path):
+    """MAG's learner holds a model-based one, average and all."""
+    config = tiny("mag")
+    config = replace(
+        config,
+        world_model=replace(config.world_model, averaging=DECAY),
+        training=replace(config.training, checkpoint_every=200),
+        total_steps=300,
+        logdir=str(tmp_path),
+    )
+    (whole,) = train(config).folders
+    cut = shutil.copytree(whole, tmp_path / "cut")
+    last, first = Checkpoints(cut / "checkpoints").steps
+    assert first < 300 <= last
+    shutil.rmtree(Checkpoints(cut / "checkpoints").at(last))
+    resume(cut)
+    training = programs(config).training
+    shape = jax.eval_shape(training.init, jax.random.key(0))
+    one, other = (
+        Checkpoints(folder / "checkpoints").restore("state", shape)[1].learner
+        for folder in (whole, cut)
+    )
+    assert other.base.trained is not None
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert_array_equal(a, b)

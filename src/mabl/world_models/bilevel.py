@@ -1,6 +1,6 @@
 """What MABL and MABL-SG are both made of: the networks of two levels, and a row as they see it."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -51,7 +51,7 @@ class BiLevel(eqx.Module):
     global_prior: Categoricals
     agent_prior: Categoricals
     heads: Heads
-    agent_prior_sees: str = eqx.field(static=True)
+    agent_prior_sees: Literal["sample", "level"] = eqx.field(static=True)
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, n_seen: int, key: PRNGKey):
         """The global posterior sees the z_agent of `n_seen` agents."""
