@@ -42,7 +42,7 @@ def alone(algo: str):
     return pytest.param(algo, marks=pytest.mark.xdist_group(f"learns-{algo}"))
 
 
-@pytest.mark.parametrize("algo", map(alone, ALGORITHMS))
+@pytest.mark.parametrize("algo", [alone(algo) for algo in ALGORITHMS])
 def test_it_learns_to_remember_and_to_coordinate(algo, compile_well):
     config = preset("quick", "test/coordination", algo)
     _, _, scores, counts = learned(config, compile_well)
@@ -58,7 +58,7 @@ def first_and_last(scores, counts):
     return [np.sum(scores, where=these) / np.sum(counts, where=these) for these in chosen]
 
 
-@pytest.mark.parametrize("algo", map(alone, ["mabl", "mappo"]))
+@pytest.mark.parametrize("algo", [alone("mabl"), alone("mappo")])
 def test_it_learns_with_continuous_actions(algo, compile_well):
     training, learner, *_ = learned(preset("quick", "test/aiming", algo), compile_well)
     space = training.env.spec.action_space

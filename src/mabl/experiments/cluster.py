@@ -60,9 +60,10 @@ class RayBackend:
         )
         self._jobs[job.name] = job
         place_of(job).unlink(missing_ok=True)
+        stop_file_of(job).unlink(missing_ok=True)
         self._tasks[job.name] = task.remote(Path.cwd(), job)
         if self._stopped:  # while it was being submitted
-            self._ray.cancel(self._tasks[job.name])
+            self.stop()
 
     def running(self) -> set[str]:
         """Names of jobs that have begun."""
@@ -87,10 +88,12 @@ class RayBackend:
         return codes
 
     def stop(self) -> None:
-        """Cancel all tasks: those that run have their processes save and end."""
+        """Have running jobs save and end, and cancel those that have not begun."""
         self._stopped = True
-        for task in self._tasks.values():
-            self._ray.cancel(task)
+        for name, task in list(self._tasks.items()):
+            stop_file_of(self._jobs[name]).touch()
+            if not place_of(self._jobs[name]).exists():
+                self._ray.cancel(task)
 
     def close(self) -> None:
         """Leave the cluster."""
@@ -103,6 +106,11 @@ def place_of(job: Job) -> Path:
     return job.folder / f"{job.name}.node"
 
 
+def stop_file_of(job: Job) -> Path:
+    """A file that tells a job to save and end: `ray.cancel` alone may be lost on a running task."""
+    return job.folder / f"{job.name}.stop"
+
+
 def _run(cwd: Path, job: Job) -> int:
     """A job on whatever node this is."""
     import ray
@@ -111,12 +119,15 @@ def _run(cwd: Path, job: Job) -> int:
     place_of(job).write_text(f"{os.uname().nodename} {ray.get_runtime_context().get_node_id()}\n")
     process = start(job)
     try:
-        while process.poll() is None:  # not in one wait, which no cancellation would end
+        while process.poll() is None and not stop_file_of(job).exists():
             time.sleep(POLL_EVERY)
-        return process.returncode
-    except BaseException:  # cancelled: it saves at the end of its cycle
+        if process.poll() is None:  # it saves at the end of its cycle
+            process.terminate()
+        return process.wait()
+    except BaseException:  # cancelled as it began
         process.terminate()
         process.wait()
         raise
     finally:
         place_of(job).unlink(missing_ok=True)
+        stop_file_of(job).unlink(missing_ok=True)
