@@ -12,7 +12,7 @@ from mabl.errors import UserError
 
 
 def read(path: Path) -> dict[str, Any]:
-    """What `Report.write` wrote. Raises UserError for anything else."""
+    """Read a file that `Report.write` wrote. Raises UserError for any other file."""
     try:
         found = json.loads(path.read_text())
         timings = {k: v["median"] for k, v in found["timings"].items()}
@@ -48,7 +48,7 @@ def table(report: Report, baseline: dict[str, Any] | None = None) -> Table:
 
 
 def title(report: Report) -> str:
-    """What was run, and where."""
+    """Name the benchmarked configuration and the machine."""
     subject, on = report.subject, report.machine
     seeds = "" if subject["num_seeds"] == 1 else f", {subject['num_seeds']} seeds"
     devices = "" if subject["num_devices"] == 1 else f" on {subject['num_devices']} devices"
@@ -60,7 +60,7 @@ def title(report: Report) -> str:
 
 
 def caption(report: Report, baseline: dict[str, Any] | None = None) -> str:
-    """What is measured once, and how what was run differs from what it is compared with."""
+    """List peak rates, compile time and memory, and differences of settings from the baseline's."""
     peak = ", ".join(
         f"{kind} {rate / 1e9:,.0f} G{'B' if kind == 'copy' else 'FLOP'}/s"
         for kind, rate in report.peak.items()

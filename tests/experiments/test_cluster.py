@@ -1,6 +1,9 @@
 """Suites on a Ray cluster of two nodes, of which one is lost."""
 
 import signal
+import subprocess
+import threading
+from types import SimpleNamespace
 
 import pytest
 from tests.experiments.tiny_suite import (
@@ -12,6 +15,8 @@ from tests.experiments.tiny_suite import (
     wait_for,
     write_suite,
 )
+
+from mabl.experiments.cluster import _run, stop_file_of
 
 ALGORITHMS = ("mappo", "mappo+more")
 STEPS = 6_000
@@ -71,6 +76,18 @@ def test_jobs_of_a_cluster_save_and_end_when_told(nodes, tmp_path):
     assert process.wait(100) == 75 and "1 to go on" in said(logdir)
     (log,) = (logdir / "tiny" / "jobs").glob("*.log")
     assert "interrupted at" in log.read_text()
+
+
+def test_a_stop_file_ends_a_job_whose_cancellation_was_lost(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sleeping = subprocess.Popen(["sleep", "300"])
+    monkeypatch.setattr("mabl.experiments.cluster.start", lambda job: sleeping)
+    node = SimpleNamespace(get_node_id=lambda: "a")
+    monkeypatch.setattr("ray.get_runtime_context", lambda: node)
+    job = SimpleNamespace(name="job", folder=tmp_path)
+    threading.Timer(0.5, stop_file_of(job).touch).start()
+    assert _run(tmp_path, job) == -signal.SIGTERM
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_cluster_that_is_not_there_is_named(tmp_path):

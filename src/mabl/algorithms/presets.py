@@ -108,7 +108,7 @@ _QUICK = {
             reward_scale=10.0,
             diagnose_every=2_000,
         ),
-        # With ReLU and 4 x 8 codes most seeds never remember all three cues (ADR 24).
+        # Dreamer-v2 fails on most seeds with ReLU and 4 x 8 codes (ADR 24).
         world_model=WorldModelConfig(
             hidden=64,
             activation="rms_silu",
@@ -136,8 +136,8 @@ _QUICK = {
 _QUICK_SMAC = replace(
     _QUICK["smax"], training=replace(_QUICK["smax"].training, reward_scale=1.0, num_envs=8)
 )
-# Nothing is known of its rewards; what is seen counts to a fine degree. Chosen on simple_spread,
-# before ADRs 20 to 24, with the paper's inputs and activation.
+# World model for rewards of unknown size and observations whose small differences matter. Chosen on
+# simple_spread before ADR 20, with the paper's inputs and activation.
 _FINE = replace(
     _QUICK_SMAC.world_model,
     activation="relu",

@@ -70,7 +70,8 @@ def policy_loss(
     Rows of the dead, and rows without a choice, do not count.
     """
     weight = rows.weight * rows.view.alive * policy.free(rows.view.available)
-    # What does not count may be no choice at all, whose ratio must not overflow.
+    # Rows of weight 0 may have no valid action: keep their old log-probability, lest the ratio
+    # overflow.
     log_prob = jnp.where(weight > 0, policy.log_prob(rows.action), rows.log_prob)
     surrogate = clipped_surrogate(log_prob, rows.log_prob, rows.advantage, clip)
     entropy = weighted_mean(policy.entropy(), weight)

@@ -63,7 +63,7 @@ class RayBackend:
         stop_file_of(job).unlink(missing_ok=True)
         self._tasks[job.name] = task.remote(Path.cwd(), job)
         if self._stopped:  # while it was being submitted
-            self.stop()
+            self._cancel(job.name)
 
     def running(self) -> set[str]:
         """Names of jobs that have begun."""
@@ -88,12 +88,15 @@ class RayBackend:
         return codes
 
     def stop(self) -> None:
-        """Have running jobs save and end, and cancel those that have not begun."""
+        """Cancel all tasks: those that run have their processes save and end."""
         self._stopped = True
-        for name, task in list(self._tasks.items()):
-            stop_file_of(self._jobs[name]).touch()
-            if not place_of(self._jobs[name]).exists():
-                self._ray.cancel(task)
+        for name in list(self._tasks):
+            self._cancel(name)
+
+    def _cancel(self, name: str) -> None:
+        """Cancel a task, and leave a stop file in case Ray loses the cancellation."""
+        stop_file_of(self._jobs[name]).touch()
+        self._ray.cancel(self._tasks[name])
 
     def close(self) -> None:
         """Leave the cluster."""
@@ -107,7 +110,7 @@ def place_of(job: Job) -> Path:
 
 
 def stop_file_of(job: Job) -> Path:
-    """A file that tells a job to save and end: `ray.cancel` alone may be lost on a running task."""
+    """File whose existence tells a job to save and end."""
     return job.folder / f"{job.name}.stop"
 
 
@@ -124,7 +127,7 @@ def _run(cwd: Path, job: Job) -> int:
         if process.poll() is None:  # it saves at the end of its cycle
             process.terminate()
         return process.wait()
-    except BaseException:  # cancelled as it began
+    except BaseException:  # cancelled: it saves at the end of its cycle
         process.terminate()
         process.wait()
         raise
