@@ -16,6 +16,7 @@ from mabl.nets.categorical import Code, CodeShape, still
 from mabl.nets.mlp import MLP, dense
 from mabl.rows import TimeStep
 from mabl.world_models.base import WorldModelConfig
+from mabl.world_models.bilevel import own_first
 from mabl.world_models.heads import Heads, Predictions
 from mabl.world_models.levels import Level
 from mabl.world_models.loss import decoder_losses, model_loss, reward_loss
@@ -262,6 +263,34 @@ def test_an_agent_prior_that_sees_the_level_knows_the_joint_action(sees):
         jax.vmap(model.nets.agent_logits)(x.agent.h, x.global_._replace(z=z))[0] for x in levels
     )
     assert np.allclose(first, second) == (sees == "sample")
+
+
+def test_own_first_orders_the_joint_action_and_names_the_agent():
+    action = jnp.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    assert_array_equal(
+        own_first(action),
+        [
+            [1, 2, 3, 4, 5, 6, 1, 0, 0],
+            [3, 4, 1, 2, 5, 6, 0, 1, 0],
+            [5, 6, 1, 2, 3, 4, 0, 0, 1],
+        ],
+    )
+
+
+@pytest.mark.parametrize("identity", [False, True])
+def test_global_levels_know_whose_they_are_with_agent_identity(identity):
+    """Two agents with the same latent have the same global embedding, or each its own."""
+    model = build(agent_identity=identity)
+    latent = jax.tree.map(lambda x: x[0], observed(model, some_rows(1))[0])
+    same = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), still(latent))
+    for action in (jnp.eye(3), jnp.eye(3)[jnp.array([0, 0, 0])]):  # different, the same
+        h = model.imagine(same, action, jax.random.key(0)).global_.h
+        assert np.allclose(h[0], h[1]) != identity
+    rows = some_rows(4)
+    moved = rows._replace(prev_action=rows.prev_action.at[2, 1].add(1) % 3)
+    before, after = (observed(model, x)[0] for x in (rows, moved))
+    assert_array_equal(before.agent.h[:, 0], after.agent.h[:, 0])  # its filter does not see others
+    assert not np.allclose(before.global_.h[2, 0], after.global_.h[2, 0])
 
 
 @pytest.mark.parametrize("sees", ["sample", "level"])

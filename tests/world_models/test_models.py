@@ -496,6 +496,16 @@ def test_sgs_agents_priors_may_see_the_teams_level():
     assert differ(prior(h, team._replace(h=-team.h)), seen.prior["agent"])
 
 
+@pytest.mark.parametrize("identity", [False, True])
+def test_sgs_agents_priors_know_whose_they_are_with_agent_identity(identity):
+    """Two agents with the same latent have the same prior, or each its own."""
+    model = build("mabl-sg", agent_identity=identity)
+    latent = at(observed(model, some_rows(4)).latents, 3)
+    same = latent._replace(agent=at(latent.agent, np.array([0, 0, 2])))
+    prior = on_host(lambda latent: model.prior(latent, jax.random.key(0))[1]["agent"])(same)
+    assert differ(prior[0], prior[1]) == identity
+
+
 def test_sgs_imagined_agents_follow_the_one_imagined_global_state():
     # Rig the agents' prior to copy the global sample, for certain.
     model = build("mabl-sg")

@@ -36,6 +36,10 @@ class WorldModelConfig:
     agent_prior_sees: Literal["sample", "level"] = "sample"
     """Input of the agent prior beside h_agent, where there are two levels: z_global as in the
     paper, or the whole level (z_global, h_global), which knows the joint action (ADR 23)."""
+    agent_identity: bool = False
+    """Tell priors whose latent they predict, where there are two levels (ADR 25): MABL's global
+    levels see the agent's own action first in the joint action, and its one-hot index; MABL-SG's
+    agent priors see the index. Off in the paper. Execution never sees it."""
     activation: Activation = "relu"
     """Hidden layers of all networks: `relu` as in the paper (appendix B.1), or `rms_silu`: RMS
     normalisation and SiLU, as in DreamerV3."""

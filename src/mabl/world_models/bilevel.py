@@ -4,6 +4,7 @@ from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import EnvSpec
@@ -53,8 +54,17 @@ class BiLevel(eqx.Module):
     heads: Heads
     agent_prior_sees: Literal["sample", "level"] = eqx.field(static=True)
 
-    def __init__(self, spec: EnvSpec, config: WorldModelConfig, n_seen: int, key: PRNGKey):
-        """The global posterior sees the z_agent of `n_seen` agents."""
+    def __init__(
+        self,
+        spec: EnvSpec,
+        config: WorldModelConfig,
+        n_seen: int,
+        key: PRNGKey,
+        joint_dim: int,
+        identity_dim: int = 0,
+    ):
+        """The global posterior sees the z_agent of `n_seen` agents, the global level a joint action
+        of `joint_dim` numbers, and agent priors the `identity_dim` of an index, if any."""
         keys = jax.random.split(key, 7)
         hidden, latent = config.hidden, config.latent
         action_dim = spec.action_space.size
@@ -62,15 +72,14 @@ class BiLevel(eqx.Module):
         self.state_scale = Normaliser.fresh(spec.state_dim) if config.standardise else None
         activation = config.activation
         self.state_encoder = MLP(spec.state_dim, hidden, hidden, 2, keys[1], activation=activation)
-        self.global_recurrent = Recurrent(
-            latent, spec.n_agents * action_dim, hidden, keys[2], activation
-        )
+        self.global_recurrent = Recurrent(latent, joint_dim, hidden, keys[2], activation)
         seen = latent._replace(n_categoricals=n_seen * latent.n_categoricals)
         self.global_posterior = Categoricals(
             (hidden, seen, hidden), hidden, latent, keys[3], activation
         )
         self.global_prior = Categoricals((hidden,), hidden, latent, keys[4], activation)
         above = (latent, hidden) if config.agent_prior_sees == "level" else (latent,)
+        above += (identity_dim,) if identity_dim else ()
         self.agent_prior = Categoricals((hidden, *above), hidden, latent, keys[5], activation)
         self.agent_prior_sees = config.agent_prior_sees
         self.heads = Heads(
@@ -86,10 +95,15 @@ class BiLevel(eqx.Module):
             activation=activation,
         )
 
-    def agent_logits(self, h: Float[Array, " D"], global_: Level) -> Float[Array, "K C"]:
-        """Logits of one agent's prior: of p(z^a | h^a, z^g), or of p(z^a | h^a, z^g, h^g)."""
+    def agent_logits(
+        self, h: Float[Array, " D"], global_: Level, *identity: Float[Array, " N"]
+    ) -> Float[Array, "K C"]:
+        """Logits of one agent's prior: of p(z^a | h^a, z^g), or of p(z^a | h^a, z^g, h^g).
+
+        `identity` is the agent's one-hot index, for priors that see it.
+        """
         above = global_.features() if self.agent_prior_sees == "level" else (global_.z,)
-        return self.agent_prior(h, *above)
+        return self.agent_prior(h, *above, *identity)
 
     def predict(self, agent: Level, full: Features) -> Predictions:
         """One agent's predictions of a row, in the environment's units."""
@@ -105,3 +119,10 @@ class BiLevel(eqx.Module):
             state=self.state_encoder.embed(standardised(row.state, self.state_scale)),
             is_first=row.is_first,
         )
+
+
+def own_first(action: Float[Array, "N A"]) -> Float[Array, "N M"]:
+    """For each agent: its own action, those of the others by index, and its one-hot index."""
+    n = action.shape[0]
+    order = jnp.array([[i, *(j for j in range(n) if j != i)] for i in range(n)])
+    return jnp.concatenate([action[order].reshape(n, -1), jnp.eye(n)], axis=-1)

@@ -11,7 +11,7 @@ from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
-from mabl.world_models.bilevel import BiLevel, Inputs, Latent
+from mabl.world_models.bilevel import BiLevel, Inputs, Latent, own_first
 from mabl.world_models.heads import Predictions
 from mabl.world_models.levels import AgentFilter, Level, forget, team_of
 
@@ -29,7 +29,9 @@ class MABL(eqx.Module):
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
         self.spec, self.config = spec, config
-        self.nets = BiLevel(spec, config, 1, key)
+        n, size = spec.n_agents, spec.action_space.size
+        joint_dim = n * size + (n if config.agent_identity else 0)
+        self.nets = BiLevel(spec, config, 1, key, joint_dim)
 
     @property
     def filter(self) -> AgentFilter:
@@ -59,10 +61,9 @@ class MABL(eqx.Module):
         h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^a_t, h^g_t)
         """
         latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
-        joint_action = prev_action.ravel()
 
         def observe_agent(
-            latent: Latent, prev_action: Array, obs: Array, key: PRNGKey
+            latent: Latent, prev_action: Array, joint_action: Array, obs: Array, key: PRNGKey
         ) -> tuple[Latent, dict[str, Array]]:
             key_agent, key_global = jax.random.split(key)
             agent, agent_logits = self.filter.infer(latent.agent, prev_action, obs, key_agent)
@@ -72,7 +73,10 @@ class MABL(eqx.Module):
             return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
 
         keys = jax.random.split(key, self.spec.n_agents)
-        return jax.vmap(observe_agent)(latent, prev_action, inputs.obs, keys)
+        joint_action, axis = self._joint_action(prev_action)
+        return jax.vmap(observe_agent, in_axes=(0, 0, axis, 0, 0))(
+            latent, prev_action, joint_action, inputs.obs, keys
+        )
 
     def prior(
         self, latent: Latent, key: PRNGKey
@@ -99,15 +103,22 @@ class MABL(eqx.Module):
 
         h_{t+1} as in `observe`, then z^g ~ p(z^g | h^g) and z^a ~ p(z^a | h^a, z^g).
         """
-        joint_action = action.ravel()
 
-        def imagine_agent(latent: Latent, action: Array, key: PRNGKey) -> Latent:
+        def imagine_agent(
+            latent: Latent, action: Array, joint_action: Array, key: PRNGKey
+        ) -> Latent:
             h_agent = self.filter.recurrent(latent.agent, action)
             h_global = self.nets.global_recurrent(latent.global_, joint_action)
             return self._transition(h_agent, h_global, key)[0]
 
         keys = jax.random.split(key, self.spec.n_agents)
-        return still(jax.vmap(imagine_agent)(latent, action, keys))
+        joint_action, axis = self._joint_action(action)
+        imagine = jax.vmap(imagine_agent, in_axes=(0, 0, axis, 0))
+        return still(imagine(latent, action, joint_action, keys))
+
+    def _joint_action(self, action: Float[Array, "N A"]) -> tuple[Float[Array, "*n M"], int | None]:
+        """The joint action as global levels see it, and its axis of agents, if they differ."""
+        return (own_first(action), 0) if self.config.agent_identity else (action.ravel(), None)
 
     def _transition(
         self,

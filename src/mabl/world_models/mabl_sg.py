@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mabl.envs.base import EnvSpec
@@ -28,7 +29,9 @@ class MABLSG(eqx.Module):
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
         self.spec, self.config = spec, config
-        self.nets = BiLevel(spec, config, spec.n_agents, key)
+        n = spec.n_agents
+        identity_dim = n if config.agent_identity else 0
+        self.nets = BiLevel(spec, config, n, key, n * spec.action_space.size, identity_dim)
 
     @property
     def filter(self) -> AgentFilter:
@@ -75,8 +78,7 @@ class MABLSG(eqx.Module):
         """
         prior, logits = self._transition(latent, key)
         if self.config.agent_prior_input == "posterior":
-            agent_logits = jax.vmap(self.nets.agent_logits, in_axes=(0, None))
-            logits["agent"] = agent_logits(latent.agent.h, latent.global_)
+            logits["agent"] = self._agent_logits(latent.agent.h, latent.global_)
         return prior, logits
 
     def imagine(self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey) -> Latent:
@@ -91,9 +93,14 @@ class MABLSG(eqx.Module):
         key_agents, key_global = jax.random.split(key)
         global_logits = self.nets.global_prior(latent.global_.h)
         global_ = Level(latent.global_.h, draw(global_logits, key_global))
-        agent_logits = jax.vmap(self.nets.agent_logits, in_axes=(0, None))(latent.agent.h, global_)
+        agent_logits = self._agent_logits(latent.agent.h, global_)
         agent = Level(latent.agent.h, draw(agent_logits, key_agents))
         return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
+
+    def _agent_logits(self, h: Float[Array, "N D"], team: Level) -> Float[Array, "N K C"]:
+        """Logits of every agent's prior."""
+        identity = (jnp.eye(self.spec.n_agents),) if self.config.agent_identity else ()
+        return jax.vmap(lambda h, *own: self.nets.agent_logits(h, team, *own))(h, *identity)
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent from its own level and the team's."""
