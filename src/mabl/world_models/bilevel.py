@@ -1,4 +1,4 @@
-"""What MABL and MABL-SG are both made of: the networks of two levels, and a row as they see it."""
+"""Networks of an agent level and a global level, and their inputs, for MABL and MABL-SG."""
 
 from typing import Literal, NamedTuple
 
@@ -59,12 +59,17 @@ class BiLevel(eqx.Module):
         spec: EnvSpec,
         config: WorldModelConfig,
         n_seen: int,
-        key: PRNGKey,
         joint_dim: int,
-        identity_dim: int = 0,
+        identity_dim: int,
+        key: PRNGKey,
     ):
-        """The global posterior sees the z_agent of `n_seen` agents, the global level a joint action
-        of `joint_dim` numbers, and agent priors the `identity_dim` of an index, if any."""
+        """Initialise all networks.
+
+        Args:
+            n_seen: agents whose z^a the global posterior sees.
+            joint_dim: width of the joint action that the global level sees.
+            identity_dim: width of the one-hot index that agent priors see; 0 if they see none.
+        """
         keys = jax.random.split(key, 7)
         hidden, latent = config.hidden, config.latent
         action_dim = spec.action_space.size
@@ -122,7 +127,14 @@ class BiLevel(eqx.Module):
 
 
 def own_first(action: Float[Array, "N A"]) -> Float[Array, "N M"]:
-    """For each agent: its own action, those of the others by index, and its one-hot index."""
+    """Arrange the joint action for each agent: its own, the others' by index, its one-hot index.
+
+    Args:
+        action: encoded actions of N agents, A numbers each.
+
+    Returns:
+        One row for each agent, of M = N * A + N numbers.
+    """
     n = action.shape[0]
     order = jnp.array([[i, *(j for j in range(n) if j != i)] for i in range(n)])
     return jnp.concatenate([action[order].reshape(n, -1), jnp.eye(n)], axis=-1)

@@ -31,7 +31,7 @@ class MABL(eqx.Module):
         self.spec, self.config = spec, config
         n, size = spec.n_agents, spec.action_space.size
         joint_dim = n * size + (n if config.agent_identity else 0)
-        self.nets = BiLevel(spec, config, 1, key, joint_dim)
+        self.nets = BiLevel(spec, config, 1, joint_dim, 0, key)
 
     @property
     def filter(self) -> AgentFilter:

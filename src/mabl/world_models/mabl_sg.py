@@ -31,7 +31,7 @@ class MABLSG(eqx.Module):
         self.spec, self.config = spec, config
         n = spec.n_agents
         identity_dim = n if config.agent_identity else 0
-        self.nets = BiLevel(spec, config, n, key, n * spec.action_space.size, identity_dim)
+        self.nets = BiLevel(spec, config, n, n * spec.action_space.size, identity_dim, key)
 
     @property
     def filter(self) -> AgentFilter:
