@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mabl.behaviour.actor import Actor, MaskedCategorical
-from mabl.envs.base import Continuous, Discrete
+from mabl.envs.base import Continuous, Discrete, EnvSpec
 from mabl.execution import (
     JointExecutor,
     LocalExecutor,
@@ -19,6 +19,7 @@ from mabl.execution import (
 )
 from mabl.nets.categorical import CodeShape
 from mabl.rows import TimeStep
+from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.levels import AgentFilter, Level
 
 SPACE = Discrete(4)
@@ -29,7 +30,9 @@ N_AGENTS, OBS, STEPS = 3, 5, 4
 def build(greedy: bool = False, out_scale: float = 3.0) -> LocalExecutor:
     """Three categoricals of four classes, h of 16."""
     key_filter, key_actor = jax.random.split(jax.random.key(0))
-    agent = AgentFilter(OBS, 4, 16, LATENT, key_filter)
+    spec = EnvSpec("stub", N_AGENTS, OBS, 6, SPACE, STEPS, "score")
+    config = WorldModelConfig(hidden=16, n_categoricals=3, n_classes=4)
+    agent = AgentFilter(spec, config, key_filter)
     actor = Actor((LATENT, 16), 4, 16, 1, out_scale, key_actor)
     return executor_of(Policy(agent, actor), SPACE, greedy)
 

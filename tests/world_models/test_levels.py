@@ -1,20 +1,34 @@
+from dataclasses import replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
+from mabl.envs.base import Discrete, EnvSpec
 from mabl.nets.categorical import Code, CodeShape, draw
-from mabl.nets.mlp import MLP, dense
+from mabl.nets.mlp import MLP, Linear, dense
+from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.levels import (
     AgentFilter,
     Categoricals,
+    Embedded,
     Level,
     Recurrent,
     forget,
+    partly_decoded,
     team_of,
 )
 
 LATENT = CodeShape(3, 4)
+SPEC = EnvSpec("stub", 2, 5, 6, Discrete(2), 10, "score")
+
+
+def filter_of(**options: Any) -> AgentFilter:
+    """Observations of 5 numbers, 2 actions, h of 8, codes of 3 x 4."""
+    config = WorldModelConfig(hidden=8, n_hidden=1, n_categoricals=3, n_classes=4)
+    return AgentFilter(SPEC, replace(config, **options), jax.random.key(0))
 
 
 def code(*index: int, n_classes: int) -> Code:
@@ -77,7 +91,7 @@ def test_a_drawn_state_has_one_class_of_each_categorical():
 
 
 def test_one_step_of_the_filter_is_h_then_z_given_h():
-    agent = AgentFilter(5, 2, 8, LATENT, jax.random.key(0))
+    agent = filter_of()
     level = Level(h=jnp.linspace(-1, 1, 8), z=code(2, 0, 3, n_classes=4))
     action, obs, key = jnp.array([0.0, 1.0]), jnp.linspace(0, 1, 5), jax.random.key(1)
     after = agent(level, action, obs, key)
@@ -88,13 +102,13 @@ def test_one_step_of_the_filter_is_h_then_z_given_h():
 
 
 def test_the_filter_starts_from_zeros():
-    start = AgentFilter(5, 2, 8, LATENT, jax.random.key(0)).initial()
+    start = filter_of().initial()
     assert_array_equal(start.h, np.zeros(8))
     assert_array_equal(start.z.onehot(), np.zeros(12))
 
 
 def test_the_filters_latents_are_alike_at_the_start_and_later_and_carry_no_gradients():
-    agent = AgentFilter(5, 2, 8, LATENT, jax.random.key(0))
+    agent = filter_of()
     assert agent.latent == LATENT
     start = agent.initial()
     after = agent(start, jnp.zeros(2), jnp.zeros(5), jax.random.key(1))
@@ -105,11 +119,12 @@ def test_the_filters_latents_are_alike_at_the_start_and_later_and_carry_no_gradi
 
 
 def test_what_is_inferred_to_train_carries_gradients_through_its_sample():
-    agent = AgentFilter(5, 2, 8, LATENT, jax.random.key(0))
+    agent = filter_of()
     level, action = Level.none(8, LATENT), jnp.zeros(2)
 
     def weighted(embed: jax.Array) -> jax.Array:
-        return agent.infer(level, action, embed, jax.random.key(1))[0].z.onehot() @ jnp.arange(12.0)
+        obs = Embedded(embed, None)
+        return agent.infer(level, action, obs, jax.random.key(1))[0].z.onehot() @ jnp.arange(12.0)
 
     assert jnp.abs(jax.grad(weighted)(jnp.ones(8))).max() > 0
 
@@ -117,14 +132,69 @@ def test_what_is_inferred_to_train_carries_gradients_through_its_sample():
 def test_features_are_z_then_h():
     level = Level(h=jnp.array([[1.0, 2.0]]), z=Code(jnp.array([[1]]), None, 3))
     assert_array_equal(dense(level.features()), [[0, 1, 0, 1, 2]])
-    agent = AgentFilter(5, 2, 8, LATENT, jax.random.key(0))
+    agent = filter_of()
     own = Level(h=jnp.arange(8.0), z=code(2, 0, 3, n_classes=4))
     assert_array_equal(dense(agent.features(own)), [0, 0, 1, 0, 1, 0, 0, 0, 0, 0, 0, 1, *range(8)])
     assert agent.obs_dim == 5
 
 
+def test_policies_see_what_policy_input_says():
+    own = Level(h=jnp.arange(8.0), z=code(2, 0, 3, n_classes=4), row=jnp.arange(5.0))
+    z_h = dense(own.features())
+    for policy_input in ("latent", "decoded", "observation"):
+        agent = filter_of(policy_input=policy_input)
+        expected = {"latent": [z_h], "decoded": [z_h, *agent.decoded(own)], "observation": own.row}
+        seen = dense(agent.features(own))
+        assert_array_equal(seen, np.hstack(expected[policy_input]))
+
+
+def test_levels_hold_the_real_row_where_inferred_and_the_decoded_one_where_imagined():
+    agent = filter_of(policy_input="observation")
+    obs = jnp.linspace(0, 1, 5)
+    real = agent(agent.initial(), jnp.zeros(2), obs, jax.random.key(1))
+    assert_array_equal(real.row, obs)
+    imagined = agent.imagined(real.h, real.z)
+    assert_allclose(imagined.row, agent.decoder(real.z, real.h), rtol=1e-6)
+    assert filter_of().imagined(real.h, real.z).row is None
+    assert filter_of()(filter_of().initial(), jnp.zeros(2), obs, jax.random.key(1)).row is None
+
+
+def test_recurrent_models_see_the_row_before_with_recurrent_sees_row():
+    agent, plain = filter_of(recurrent_sees="row"), filter_of(policy_input="observation")
+    own = Level(h=jnp.arange(8.0), z=code(2, 0, 3, n_classes=4), row=jnp.arange(5.0))
+    other = own._replace(row=own.row + 1.0)
+    action = jnp.array([0.0, 1.0])
+    assert jnp.abs(agent.recurrent(own, action) - agent.recurrent(other, action)).max() > 1e-3
+    assert_array_equal(plain.recurrent(own, action), plain.recurrent(other, action))
+    recurrent = Recurrent(LATENT, 2, 8, jax.random.key(1), row_dim=5)
+    whole = Linear(12 + 2 + 5, 8, jax.random.split(jax.random.key(1))[0])
+    x = whole(jnp.concatenate([own.z.onehot(), action, own.row]))
+    expected = recurrent.cell(jax.nn.relu(x), own.h)
+    assert_allclose(recurrent(own, action), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_share_of_rows_is_decoded():
+    agent = filter_of(policy_input="observation")
+    own = Level(h=jnp.arange(8.0), z=code(2, 0, 3, n_classes=4), row=jnp.arange(5.0))
+    (decoded,) = agent.decoded(own)
+
+    def mixed(share: float) -> jax.Array:
+        keys = jax.random.split(jax.random.key(0), 400)
+        return jax.vmap(lambda key: partly_decoded(own, agent.decoder, share, key).row)(keys)
+
+    assert_array_equal(mixed(0.0), jnp.tile(own.row, (400, 1)))
+    assert_allclose(mixed(1.0), jnp.tile(decoded, (400, 1)), rtol=1e-6)
+    half = np.isclose(mixed(0.25), decoded).all(-1)
+    assert 0.15 < half.mean() < 0.35
+    assert_array_equal(mixed(0.25)[~half], jnp.tile(own.row, ((~half).sum(), 1)))
+    bare = own._replace(row=None)
+    assert partly_decoded(bare, agent.decoder, 1.0, jax.random.key(0)) is bare
+
+
 def test_a_level_of_nothing_is_zeros():
     level = Level.none(2, LATENT)
+    assert level.row is None
+    assert_array_equal(Level.none(2, LATENT, 3).row, np.zeros(3))
     assert_array_equal(dense(level.features()), np.zeros(14))
     assert_array_equal(level.z.index, [4, 4, 4])
 

@@ -46,11 +46,22 @@ class WorldModelConfig:
     standardise: bool = False
     """Standardise observations and states by their running mean and variance, for encoders and for
     the observations' loss."""
-    policy_input: Literal["latent", "decoded"] = "latent"
-    """Input of policies and of MAPPO's critics: the latent (z, h) as in the paper, or also the
-    observation decoded from it."""
+    policy_input: Literal["latent", "decoded", "observation"] = "latent"
+    """Input of policies: the latent (z, h) as in the paper; the latent and the observation decoded
+    from it; or the observation alone, which is the real one at real rows and decoded at imagined
+    ones, so that policies have no memory. Critics see the latent, and the observation if policies
+    do."""
+    recurrent_sees: Literal["latent", "row"] = "latent"
+    """Input of recurrent models beside the action: z of the row before as in the paper, or also
+    what the level encodes of that row: the observation, or the state. Imagined rows have decoded
+    ones (ADR 26)."""
+    decoded_share: float = 0.0
+    """Share of real rows of which recurrent models that see rows are trained on decoded ones, as
+    in imagination."""
     obs_weight: float = 1.0
     """Weight of the observations' loss."""
+    state_weight: float = 1.0
+    """Weight of the loss of the state that global levels decode, where recurrent models see it."""
     outcomes: Literal["row", "transition"] = "row"
     """Input of the predictors of reward and termination: the row's own latent (z_t, h_t) as in the
     paper, or (z_{t-1}, h_t), which does not know the row's observation and is what imagination has,
@@ -100,14 +111,25 @@ class WorldModelConfig:
         """Of a latent state."""
         return CodeShape(self.n_categoricals, self.n_classes)
 
+    @property
+    def filter_decodes(self) -> bool:
+        """Whether the decoder of observations is the filter's; otherwise it is one of the heads."""
+        return self.policy_input != "latent" or self.recurrent_sees == "row"
+
+    @property
+    def levels_hold_rows(self) -> bool:
+        """Whether latents hold what their level encodes of the row."""
+        return self.policy_input == "observation" or self.recurrent_sees == "row"
+
     def __post_init__(self) -> None:
         require_positive(self, "hidden", "n_hidden", "n_categoricals", "n_classes", "batch_size")
         require_positive(self, "learning_rate", "grad_clip")
         require_between(self, 2, inf, "batch_length")
         require_between(self, 1, inf, "recency")
         require_between(self, 0, 0.9999, "averaging")
+        require_between(self, 0, 1, "decoded_share")
         require_between(self, 0, inf, "kl_weight", "kl_prior_weight", "kl_posterior_weight")
-        require_between(self, 0, inf, "free_nats", "obs_weight", "overshooting")
+        require_between(self, 0, inf, "free_nats", "obs_weight", "state_weight", "overshooting")
         require_between(self, 0, inf, "reward_weight", "agent_reward_weight", "end_weight")
         require_between(self, 0, inf, "absorbing")
 

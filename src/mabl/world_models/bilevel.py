@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import EnvSpec
-from mabl.nets.mlp import MLP, Features, parts_of
+from mabl.nets.categorical import Code
+from mabl.nets.mlp import MLP, Features
 from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
@@ -17,9 +18,11 @@ from mabl.world_models.heads import Heads, Predictions
 from mabl.world_models.levels import (
     AgentFilter,
     Categoricals,
+    Embedded,
     Level,
     Recurrent,
     restored,
+    row_decoder,
     standardised,
 )
 
@@ -35,8 +38,8 @@ class Inputs(NamedTuple):
     """A row as the scan over time needs it: all that does not recur is computed beforehand."""
 
     prev_action: Float[Array, "N A"]
-    obs: Float[Array, "N D"]
-    state: Float[Array, " D"]
+    obs: Embedded
+    state: Embedded
     is_first: Bool[Array, ""]
 
 
@@ -50,9 +53,13 @@ class BiLevel(eqx.Module):
     global_recurrent: Recurrent
     global_posterior: Categoricals
     global_prior: Categoricals
+    state_decoder: MLP | None
+    """The state's decoder, where recurrent models see rows."""
     agent_prior: Categoricals
     heads: Heads
     agent_prior_sees: Literal["sample", "level"] = eqx.field(static=True)
+    state_dim: int = eqx.field(static=True)
+    """Width of the state that global levels hold; 0 if they hold none."""
 
     def __init__(
         self,
@@ -73,11 +80,18 @@ class BiLevel(eqx.Module):
         keys = jax.random.split(key, 7)
         hidden, latent = config.hidden, config.latent
         action_dim = spec.action_space.size
-        self.filter = AgentFilter.of(spec, config, keys[0])
+        self.filter = AgentFilter(spec, config, keys[0])
         self.state_scale = Normaliser.fresh(spec.state_dim) if config.standardise else None
         activation = config.activation
         self.state_encoder = MLP(spec.state_dim, hidden, hidden, 2, keys[1], activation=activation)
-        self.global_recurrent = Recurrent(latent, joint_dim, hidden, keys[2], activation)
+        self.state_dim = spec.state_dim if config.recurrent_sees == "row" else 0
+        self.global_recurrent = Recurrent(
+            latent, joint_dim, hidden, keys[2], activation, self.state_dim
+        )
+        self.state_decoder = None
+        if self.state_dim:
+            key_state = jax.random.fold_in(key, 0)
+            self.state_decoder = row_decoder(config, spec.state_dim, key_state)
         seen = latent._replace(n_categoricals=n_seen * latent.n_categoricals)
         self.global_posterior = Categoricals(
             (hidden, seen, hidden), hidden, latent, keys[3], activation
@@ -90,7 +104,7 @@ class BiLevel(eqx.Module):
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, latent, hidden, hidden),
-            obs_dim=spec.obs_dim if config.policy_input == "latent" else None,
+            obs_dim=None if config.filter_decodes else spec.obs_dim,
             action_dim=action_dim,
             hidden=hidden,
             n_hidden=config.n_hidden,
@@ -110,18 +124,39 @@ class BiLevel(eqx.Module):
         above = global_.features() if self.agent_prior_sees == "level" else (global_.z,)
         return self.agent_prior(h, *above, *identity)
 
-    def predict(self, agent: Level, full: Features) -> Predictions:
+    def initial_global(self, config: WorldModelConfig) -> Level:
+        """A global level before an episode's first row: zeros."""
+        return Level.none(config.hidden, config.latent, self.state_dim)
+
+    def imagined_global(self, h: Float[Array, " D"], z: Code) -> Level:
+        """A global level of an imagined row, with the decoded state if levels hold rows."""
+        level = Level(h, z)
+        if self.state_decoder is None:
+            return level
+        return level._replace(row=self.state_decoder(*level.features()))
+
+    def predict(self, agent: Level, global_: Level) -> Predictions:
         """One agent's predictions of a row, in the environment's units."""
-        seen = parts_of(self.filter.features(agent))
-        predicted = self.heads(seen[:2], full, *seen[2:])
+        full = (agent.z, global_.z, agent.h, global_.h)
+        predicted = self.heads(agent.features(), full, *self.filter.decoded(agent))
+        if self.state_decoder is not None:
+            state = self.state_decoder(*global_.features())
+            predicted = predicted._replace(state=restored(state, self.state_scale))
         return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
+
+    def critic_features(self, agent: Level, global_: Level) -> Features:
+        """(z^a, z^g, h^a, h^g) of one agent, its observation if policies see it, and the state if
+        the global level holds it."""
+        state = () if global_.row is None else (global_.row,)
+        return agent.z, global_.z, agent.h, global_.h, *self.filter.seen(agent), *state
 
     def encode(self, row: TimeStep, spec: EnvSpec) -> Inputs:
         """Encode actions, observations and the state of one row."""
+        state = standardised(row.state, self.state_scale)
         return Inputs(
             prev_action=spec.action_space.encode(row.prev_action),
             obs=jax.vmap(self.filter.embed)(row.obs),
-            state=self.state_encoder.embed(standardised(row.state, self.state_scale)),
+            state=Embedded(self.state_encoder.embed(state), state if self.state_dim else None),
             is_first=row.is_first,
         )
 

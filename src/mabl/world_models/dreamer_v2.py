@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from mabl.envs.base import EnvSpec
 from mabl.nets.categorical import draw, still
-from mabl.nets.mlp import Features, parts_of
+from mabl.nets.mlp import Features
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
@@ -16,8 +16,10 @@ from mabl.world_models.heads import Heads, Predictions
 from mabl.world_models.levels import (
     AgentFilter,
     Categoricals,
+    Embedded,
     Level,
     forget,
+    partly_decoded,
     restored,
     team_of,
 )
@@ -27,7 +29,7 @@ class Inputs(NamedTuple):
     """A row as the scan over time needs it."""
 
     prev_action: Float[Array, "N A"]
-    obs: Float[Array, "N D"]
+    obs: Embedded
     is_first: Bool[Array, ""]
 
 
@@ -41,17 +43,18 @@ class DreamerV2(eqx.Module):
     agent_prior: Categoricals
     heads: Heads
     spec: EnvSpec = eqx.field(static=True)
+    decoded_share: float = eqx.field(static=True)
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
         keys = jax.random.split(key, 3)
         hidden, latent = config.hidden, config.latent
-        self.spec = spec
-        self.filter = AgentFilter.of(spec, config, keys[0])
+        self.spec, self.decoded_share = spec, config.decoded_share
+        self.filter = AgentFilter(spec, config, keys[0])
         self.agent_prior = Categoricals((hidden,), hidden, latent, keys[1], config.activation)
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, hidden),
-            obs_dim=spec.obs_dim if config.policy_input == "latent" else None,
+            obs_dim=None if config.filter_decodes else spec.obs_dim,
             action_dim=spec.action_space.size,
             hidden=hidden,
             n_hidden=config.n_hidden,
@@ -63,8 +66,7 @@ class DreamerV2(eqx.Module):
 
     def initial(self) -> Level:
         """The team's latent before an episode's first row: zeros."""
-        own = Level.none(self.filter.hidden, self.filter.latent)
-        return team_of(self.spec.n_agents, own)
+        return team_of(self.spec.n_agents, self.filter.learning())
 
     def encode(self, row: TimeStep) -> Inputs:
         """Encode actions and observations of one row."""
@@ -78,6 +80,8 @@ class DreamerV2(eqx.Module):
         self, latent: Level, inputs: Inputs, key: PRNGKey, train: bool = False
     ) -> tuple[Level, dict[str, Float[Array, "N K C"]]]:
         """h_t = f(h_{t-1}, z_{t-1}, a^i_{t-1}), z_t ~ q(z_t | o^i_t, h_t) of every agent."""
+        if train and self.decoded_share:
+            latent = self._partly_decoded(latent, jax.random.fold_in(key, 0))
         latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
         keys = jax.random.split(key, self.spec.n_agents)
         latent, logits = jax.vmap(self.filter.infer)(latent, prev_action, inputs.obs, keys)
@@ -86,7 +90,8 @@ class DreamerV2(eqx.Module):
     def prior(self, latent: Level, key: PRNGKey) -> tuple[Level, dict[str, Float[Array, "N K C"]]]:
         """z_t ~ p(z_t | h_t) of every agent."""
         logits = jax.vmap(self.agent_prior)(latent.h)
-        return Level(latent.h, draw(logits, key)), {"agent": logits}
+        level = jax.vmap(self.filter.imagined)(latent.h, draw(logits, key))
+        return level, {"agent": logits}
 
     def imagine(self, latent: Level, action: Float[Array, "N A"], key: PRNGKey) -> Level:
         """Prior latents of the next row, every agent's after its own action."""
@@ -95,14 +100,26 @@ class DreamerV2(eqx.Module):
 
     def predict(self, latent: Level) -> Predictions:
         """Decode a row for every agent from its own latent."""
-        seen = parts_of(self.actor_features(latent))
-        predicted = jax.vmap(self.heads)(seen[:2], seen[:2], *seen[2:])
-        return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
+
+        def decode(level: Level) -> Predictions:
+            seen = level.features()
+            predicted = self.heads(seen, seen, *self.filter.decoded(level))
+            return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
+
+        return jax.vmap(decode)(latent)
+
+    def _partly_decoded(self, latent: Level, key: PRNGKey) -> Level:
+        """Decoded observations at a share of the real rows (`decoded_share`)."""
+
+        def agent(level: Level, key: PRNGKey) -> Level:
+            return partly_decoded(level, self.filter.decoder, self.decoded_share, key)
+
+        return jax.vmap(agent)(latent, jax.random.split(key, self.spec.n_agents))
 
     def actor_features(self, latent: Level) -> Features:
-        """Policy inputs: (z, h), and the decoded observation if there is a decoder."""
+        """Policy inputs: (z, h), or as `WorldModelConfig.policy_input` says."""
         return jax.vmap(self.filter.features)(latent)
 
     def critic_features(self, latent: Level) -> Features:
-        """The policy inputs: there is no other level."""
-        return self.actor_features(latent)
+        """(z, h), and the observation if policies see it: there is no other level."""
+        return *latent.features(), *jax.vmap(self.filter.seen)(latent)

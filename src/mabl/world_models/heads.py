@@ -39,6 +39,8 @@ class Predictions(NamedTuple):
     """The agent's own previous action: logits if discrete, mean if continuous."""
     win: Float[Array, "*b"] | None = None
     """Logit of p(win | the episode ends here), where scores tell wins."""
+    state: Float[Array, "*b S"] | None = None
+    """The environment's state, where global levels decode it."""
 
 
 class Heads(eqx.Module):

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from mabl.envs.base import EnvSpec
 from mabl.nets.categorical import Code, CodeShape, draw, still, unflatten
 from mabl.nets.gru import GRU
-from mabl.nets.mlp import MLP, Activation, Features, Linear, Part, Widths, activate, parts_of
+from mabl.nets.mlp import MLP, Activation, Features, Linear, Part, Widths, activate
 from mabl.nets.normaliser import Normaliser
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
@@ -23,23 +23,40 @@ class Level(NamedTuple):
 
     h: Float[Array, "*b D"]
     z: Code
+    row: Float[Array, "*b F"] | None = None
+    """The observation (agent level) or the state (global level), standardised: the real one where
+    the latent is inferred, the decoded one where it is imagined. None where no network sees it."""
 
     @classmethod
-    def none(cls, hidden: int, shape: CodeShape) -> "Level":
-        """Before an episode's first row: zeros."""
-        return cls(jnp.zeros(hidden), Code.none(shape))
+    def none(cls, hidden: int, shape: CodeShape, row_dim: int = 0) -> "Level":
+        """Before an episode's first row: zeros. A `row_dim` of 0 is a level that holds no row."""
+        row = jnp.zeros(row_dim) if row_dim else None
+        return cls(jnp.zeros(hidden), Code.none(shape), row)
 
     def features(self) -> Features:
         """(z, h), as networks see them."""
         return self.z, self.h
 
 
+class Embedded(NamedTuple):
+    """An observation or a state of one row, as a level's posterior needs it."""
+
+    code: Float[Array, "*b D"]
+    """Its encoding."""
+    row: Float[Array, "*b F"] | None
+    """Itself, standardised, for levels that hold it."""
+
+
 class Recurrent(eqx.Module):
-    """Recurrent model h_t = f(h_{t-1}, z_{t-1}, a_{t-1}): a GRU behind one hidden layer."""
+    """Recurrent model h_t = f(h_{t-1}, z_{t-1}, a_{t-1}): a GRU behind one hidden layer.
+
+    With `row_dim` it also sees what the level holds of the row before, of `row_dim` numbers.
+    """
 
     inputs: Linear
     cell: GRU
     activation: Activation = eqx.field(static=True)
+    sees_row: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -48,15 +65,18 @@ class Recurrent(eqx.Module):
         hidden: int,
         key: PRNGKey,
         activation: Activation = "relu",
+        row_dim: int = 0,
     ):
-        self.activation = activation
+        self.activation, self.sees_row = activation, row_dim > 0
         key_inputs, key_cell = jax.random.split(key)
-        self.inputs = Linear((latent, action_dim), hidden, key_inputs)
+        seen = (latent, action_dim, row_dim) if row_dim else (latent, action_dim)
+        self.inputs = Linear(seen, hidden, key_inputs)
         self.cell = GRU(hidden, hidden, key_cell)
 
     def __call__(self, level: Level, action: Float[Array, " A"]) -> Float[Array, " D"]:
         """One step; `action` is encoded, the agent's own or the joint one."""
-        x = activate(self.inputs(level.z, action), self.activation)
+        row = (level.row,) if self.sees_row else ()
+        x = activate(self.inputs(level.z, action, *row), self.activation)  # pyright: ignore[reportArgumentType]
         return self.cell(x, level.h)
 
 
@@ -83,17 +103,21 @@ class Categoricals(eqx.Module):
         return unflatten(self.mlp(*inputs), self.n_classes)
 
 
-def policy_decoder(config: WorldModelConfig, obs_dim: int, key: PRNGKey) -> MLP | None:
-    """Decoder of observations for the filter, or None if policies see the latent alone."""
-    if config.policy_input == "latent":
-        return None
+def row_decoder(config: WorldModelConfig, row_dim: int, key: PRNGKey) -> MLP:
+    """Decoder of what a level encodes of a row, `[row_dim]`, from its (z, h)."""
     seen, n = (config.latent, config.hidden), config.n_hidden
-    return MLP(seen, obs_dim, config.hidden, n, key, activation=config.activation)
+    return MLP(seen, row_dim, config.hidden, n, key, activation=config.activation)
 
 
-def with_decoded(features: Features, decoder: MLP | None) -> Features:
-    """(z, h) and, if there is a decoder, the observation decoded from them."""
-    return features if decoder is None else (*parts_of(features), decoder(*parts_of(features)))
+def partly_decoded(level: Level, decoder: MLP | None, share: float, key: PRNGKey) -> Level:
+    """Replace the row that one level holds by what it decodes, with probability `share`.
+
+    The level is returned as it is where it holds no row or `share` is 0.
+    """
+    if level.row is None or decoder is None or share == 0:
+        return level
+    decoded = decoder(*level.features())
+    return level._replace(row=jnp.where(jax.random.bernoulli(key, share), decoded, level.row))
 
 
 def team_of(n_agents: int, own: Tree) -> Tree:
@@ -120,7 +144,9 @@ def arriving(before: Tree, after: Tree) -> Tree:
     """
 
     def mix(before: Any, after: Any) -> Any:
-        return Level(after.h, before.z) if isinstance(after, Level) else after
+        if isinstance(after, Level):
+            return after._replace(z=before.z, row=before.row)
+        return after
 
     return jax.tree.map(mix, before, after, is_leaf=lambda x: isinstance(x, Level))
 
@@ -146,62 +172,61 @@ class AgentFilter(eqx.Module):
     recurrent: Recurrent
     posterior: Categoricals
     decoder: MLP | None
-    """The observation's decoder, where policies see what it decodes."""
+    """The observation's decoder, where policies or recurrent models see observations."""
     scale: Normaliser | None
     """Running mean and variance of observations, by which they are standardised."""
     obs_dim: int = eqx.field(static=True)
     latent: CodeShape = eqx.field(static=True)
     hidden: int = eqx.field(static=True)
+    policy_input: str = eqx.field(static=True)
+    holds_row: bool = eqx.field(static=True)
 
-    def __init__(
-        self,
-        obs_dim: int,
-        action_dim: int,
-        hidden: int,
-        latent: CodeShape,
-        key: PRNGKey,
-        standardise: bool = False,
-        activation: Activation = "relu",
-        decoder: MLP | None = None,
-    ):
-        self.decoder = decoder
-        self.scale = Normaliser.fresh(obs_dim) if standardise else None
-        key_encoder, key_recurrent, key_posterior = jax.random.split(key, 3)
-        self.obs_dim, self.latent, self.hidden = obs_dim, latent, hidden
-        self.encoder = MLP(obs_dim, hidden, hidden, 2, key_encoder, activation=activation)
-        self.recurrent = Recurrent(latent, action_dim, hidden, key_recurrent, activation)
-        self.posterior = Categoricals((hidden, hidden), hidden, latent, key_posterior, activation)
-
-    @classmethod
-    def of(cls, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey) -> "AgentFilter":
-        """The filter of an environment's agents, as `config` sizes it."""
+    def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
+        hidden, latent, activation = config.hidden, config.latent, config.activation
+        self.obs_dim, self.hidden, self.latent = spec.obs_dim, hidden, latent
+        self.policy_input, self.holds_row = config.policy_input, config.levels_hold_rows
+        self.scale = Normaliser.fresh(spec.obs_dim) if config.standardise else None
         key_own, key_decoder = jax.random.split(key)
-        return cls(
-            spec.obs_dim,
+        key_encoder, key_recurrent, key_posterior = jax.random.split(key_own, 3)
+        self.encoder = MLP(spec.obs_dim, hidden, hidden, 2, key_encoder, activation=activation)
+        self.recurrent = Recurrent(
+            latent,
             spec.action_space.size,
-            config.hidden,
-            config.latent,
-            key_own,
-            config.standardise,
-            config.activation,
-            policy_decoder(config, spec.obs_dim, key_decoder),
+            hidden,
+            key_recurrent,
+            activation,
+            spec.obs_dim if config.recurrent_sees == "row" else 0,
         )
+        self.posterior = Categoricals((hidden, hidden), hidden, latent, key_posterior, activation)
+        self.decoder = None
+        if config.filter_decodes:
+            self.decoder = row_decoder(config, spec.obs_dim, key_decoder)
+
+    def learning(self) -> Level:
+        """The latent before an episode's first row: zeros, through which gradients can flow."""
+        return Level.none(self.hidden, self.latent, self.obs_dim if self.holds_row else 0)
 
     def initial(self) -> Level:
-        """The latent before an episode's first row: zeros."""
-        return still(Level.none(self.hidden, self.latent))
+        """The same for execution, without a way for gradients."""
+        return still(self.learning())
 
-    def embed(self, obs: Float[Array, " O"]) -> Float[Array, " D"]:
+    def embed(self, obs: Float[Array, " O"]) -> Embedded:
         """Encode o_t^i; independent of the past, so that training does it outside the scan."""
-        return self.encoder.embed(standardised(obs, self.scale))
+        obs = standardised(obs, self.scale)
+        return Embedded(self.encoder.embed(obs), obs if self.holds_row else None)
 
     def infer(
-        self, level: Level, prev_action: Float[Array, " A"], embed: Float[Array, " D"], key: PRNGKey
+        self, level: Level, prev_action: Float[Array, " A"], obs: Embedded, key: PRNGKey
     ) -> tuple[Level, Float[Array, "K C"]]:
         """h_t = f(h_{t-1}, z_{t-1}, a_{t-1}^i), then z_t ~ q(z_t | o_t^i, h_t) and its logits."""
         h = self.recurrent(level, prev_action)
-        logits = self.posterior(h, embed)
-        return Level(h, draw(logits, key)), logits
+        logits = self.posterior(h, obs.code)
+        return Level(h, draw(logits, key), obs.row), logits
+
+    def imagined(self, h: Float[Array, " D"], z: Code) -> Level:
+        """The latent of an imagined row, with the decoded observation if levels hold rows."""
+        level = Level(h, z)
+        return level._replace(row=self.decoded(level)[0]) if self.holds_row else level
 
     def __call__(
         self, level: Level, prev_action: Float[Array, " A"], obs: Float[Array, " O"], key: PRNGKey
@@ -209,7 +234,19 @@ class AgentFilter(eqx.Module):
         """One step of execution; the caller resets `level` and `prev_action` at a first row."""
         return still(self.infer(level, prev_action, self.embed(obs), key)[0])
 
+    def decoded(self, level: Level) -> tuple[Float[Array, " O"], ...]:
+        """The standardised observation that (z, h) decodes to; nothing without a decoder."""
+        return () if self.decoder is None else (self.decoder(*level.features()),)
+
+    def seen(self, level: Level) -> tuple[Float[Array, " O"], ...]:
+        """The observation as policies see it: decoded, the one that the level holds, or none."""
+        if self.policy_input == "decoded":
+            return self.decoded(level)
+        return (level.row,) if self.policy_input == "observation" else ()  # pyright: ignore[reportReturnType]
+
     def features(self, level: Level) -> Features:
-        """Input of one agent's policy: (z_t, h_t), and the decoded observation if there is a
-        decoder."""
-        return with_decoded(level.features(), self.decoder)
+        """Input of one agent's policy: (z_t, h_t), both and the decoded observation, or the
+        observation alone (`WorldModelConfig.policy_input`)."""
+        if self.policy_input == "observation":
+            return self.seen(level)
+        return *level.features(), *self.seen(level)

@@ -22,6 +22,7 @@ from mabl.world_models.sequences import (
     observe_batch,
     predict_sequence,
     predict_step,
+    state_std,
 )
 
 
@@ -48,13 +49,14 @@ def model_loss(
     key_observe, key_absorbing = jax.random.split(key)
     observed = observe_batch(model, rows, key_observe, train=True)
     follows = followers(rows.is_first)[..., None]
-    predicted, std = predict_sequence(model, observed.latents, config), obs_std(model)
-    losses = decoder_losses(predicted, rows, config, action_space, std)
+    predicted = predict_sequence(model, observed.latents, config)
+    units = obs_std(model), state_std(model)
+    losses = decoder_losses(predicted, rows, config, action_space, *units)
     if config.outcomes == "transition":
         losses |= {name: follows * losses[name] for name in OUTCOMES if name in losses}
     if config.overshooting:
         ahead = jax.vmap(jax.vmap(model.predict))(observed.prior_latents)
-        for name, loss in decoder_losses(ahead, rows, config, action_space, std).items():
+        for name, loss in decoder_losses(ahead, rows, config, action_space, *units).items():
             if config.outcomes == "row" or name not in OUTCOMES:
                 losses[f"ahead_{name}"] = config.overshooting * follows * loss
     known = follows | rows.is_first[..., None]
@@ -143,14 +145,15 @@ def decoder_losses(
     config: WorldModelConfig,
     action_space: ActionSpace,
     obs_std: Float[Array, " O"] | float = 1.0,
+    state_std: Float[Array, " S"] | float = 1.0,
 ) -> dict[str, Float[Array, "*b N"]]:
     """-log likelihoods of rows `[*b, ...]` under what is decoded from their latents, weighted.
 
     -log p(o^i | z^a, h^a), -log p(r^i | z^a, h^a), and -log p(. | z^a, z^g, h^a, h^g) of
     termination, availability and the action a^i_{t-1} (sections 3.1.2 and 3.2), and of life
     (ADR 9). Observations and actions of the dead do not count, nor the action before a first row,
-    nor wins on rows that do not end an episode. Errors of observations are in units of
-    `obs_std`, by feature.
+    nor wins on rows that do not end an episode. Errors of observations and of the state are in
+    units of `obs_std` and `state_std`, by feature.
     """
     alive = rows.alive.astype(jnp.float32)
     acted = alive * ~rows.is_first[..., None]
@@ -170,6 +173,11 @@ def decoder_losses(
         "alive": config.end_weight * optax.sigmoid_binary_cross_entropy(predicted.alive, alive),
         "action": acted * action_loss(predicted.action, rows.prev_action, action_space),
     }
+    if predicted.state is not None:
+        std = jnp.broadcast_to(state_std, predicted.state.shape)
+        state = jnp.broadcast_to(rows.state[..., None, :], predicted.state.shape)
+        error = optax.huber_loss(predicted.state / std, state / std)
+        losses["state"] = config.state_weight * error.sum(-1)
     if predicted.win is not None:
         # An episode that was cut because its worker was lost has no score.
         known = (is_last(rows) & jnp.isfinite(rows.score))[..., None]

@@ -13,7 +13,14 @@ from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.bilevel import BiLevel, Inputs, Latent, own_first
 from mabl.world_models.heads import Predictions
-from mabl.world_models.levels import AgentFilter, Level, forget, team_of
+from mabl.world_models.levels import (
+    AgentFilter,
+    Embedded,
+    Level,
+    forget,
+    partly_decoded,
+    team_of,
+)
 
 
 class MABL(eqx.Module):
@@ -45,8 +52,8 @@ class MABL(eqx.Module):
 
     def initial(self) -> Latent:
         """The team's latent before an episode's first row: zeros."""
-        level = team_of(self.spec.n_agents, Level.none(self.config.hidden, self.config.latent))
-        return Latent(agent=level, global_=level)
+        level = Latent(self.filter.learning(), self.nets.initial_global(self.config))
+        return team_of(self.spec.n_agents, level)
 
     def encode(self, row: TimeStep) -> Inputs:
         """Encode actions, observations and the state of one row."""
@@ -60,16 +67,19 @@ class MABL(eqx.Module):
         h^a_t = f(h^a_{t-1}, z^a_{t-1}, a^i_{t-1}),   z^a_t ~ q(z^a_t | o^i_t, h^a_t)
         h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^a_t, h^g_t)
         """
+        if train and self.config.decoded_share:
+            keys = jax.random.split(jax.random.fold_in(key, 0), self.spec.n_agents)
+            latent = jax.vmap(self._partly_decoded)(latent, keys)
         latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
 
         def observe_agent(
-            latent: Latent, prev_action: Array, joint_action: Array, obs: Array, key: PRNGKey
+            latent: Latent, prev_action: Array, joint_action: Array, obs: Embedded, key: PRNGKey
         ) -> tuple[Latent, dict[str, Array]]:
             key_agent, key_global = jax.random.split(key)
             agent, agent_logits = self.filter.infer(latent.agent, prev_action, obs, key_agent)
             h = self.nets.global_recurrent(latent.global_, joint_action)
-            global_logits = self.nets.global_posterior(inputs.state, agent.z, h)
-            global_ = Level(h, draw(global_logits, key_global))
+            global_logits = self.nets.global_posterior(inputs.state.code, agent.z, h)
+            global_ = Level(h, draw(global_logits, key_global), inputs.state.row)
             return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
 
         keys = jax.random.split(key, self.spec.n_agents)
@@ -120,6 +130,14 @@ class MABL(eqx.Module):
         """The joint action as global levels see it, and its axis of agents, if they differ."""
         return (own_first(action), 0) if self.config.agent_identity else (action.ravel(), None)
 
+    def _partly_decoded(self, latent: Latent, key: PRNGKey) -> Latent:
+        """One agent's latent with decoded rows at a share of the real ones (`decoded_share`)."""
+        share, (key_agent, key_global) = self.config.decoded_share, jax.random.split(key)
+        return Latent(
+            partly_decoded(latent.agent, self.filter.decoder, share, key_agent),
+            partly_decoded(latent.global_, self.nets.state_decoder, share, key_global),
+        )
+
     def _transition(
         self,
         h_agent: Float[Array, " D"],
@@ -132,10 +150,9 @@ class MABL(eqx.Module):
         """
         key_agent, key_global = jax.random.split(key)
         global_logits = self.nets.global_prior(h_global)
-        sample = draw(global_logits, key_global)
-        global_ = Level(h_global, sample)
+        global_ = self.nets.imagined_global(h_global, draw(global_logits, key_global))
         agent_logits = self.nets.agent_logits(h_agent, global_)
-        agent = Level(h_agent, draw(agent_logits, key_agent))
+        agent = self.filter.imagined(h_agent, draw(agent_logits, key_agent))
         return Latent(agent, global_), {
             "agent": agent_logits,
             "global": global_logits,
@@ -147,19 +164,15 @@ class MABL(eqx.Module):
         o^i_t from (z^a, h^a); r^i_t likewise (`config.reward_input`); termination, availability and
         a^i_{t-1} from both levels.
         """
-        return jax.vmap(self.nets.predict)(latent.agent, self._both(latent))
+        return jax.vmap(self.nets.predict)(latent.agent, latent.global_)
 
     def actor_features(self, latent: Latent) -> Features:
-        """Policy inputs: (z^a, h^a) (section 3.3), and the decoded observation, if any."""
+        """Policy inputs: (z^a, h^a) (section 3.3), or as `config.policy_input` says."""
         return jax.vmap(self.filter.features)(latent.agent)
 
     def critic_features(self, latent: Latent) -> Features:
-        """Critic inputs: (z^a, z^g, h^a, h^g), and the decoded observation, if any."""
-        return *self._both(latent), *self.actor_features(latent)[2:]
-
-    def _both(self, latent: Latent) -> Features:
-        """(z^a, z^g, h^a, h^g)."""
-        return latent.agent.z, latent.global_.z, latent.agent.h, latent.global_.h
+        """Critic inputs: both levels, and what networks see of the row."""
+        return jax.vmap(self.nets.critic_features)(latent.agent, latent.global_)
 
     def global_features(self, latent: Latent) -> Code:
         """z^g: what QMIX's mixer sees (section 3.3)."""

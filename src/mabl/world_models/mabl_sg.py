@@ -14,7 +14,7 @@ from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.bilevel import BiLevel, Inputs, Latent
 from mabl.world_models.heads import Predictions
-from mabl.world_models.levels import AgentFilter, Level, forget, team_of
+from mabl.world_models.levels import AgentFilter, Level, forget, partly_decoded, team_of
 
 
 class MABLSG(eqx.Module):
@@ -45,8 +45,8 @@ class MABLSG(eqx.Module):
 
     def initial(self) -> Latent:
         """The latents before an episode's first row: zeros."""
-        level = Level.none(self.config.hidden, self.config.latent)
-        return Latent(agent=team_of(self.spec.n_agents, level), global_=level)
+        agents = team_of(self.spec.n_agents, self.filter.learning())
+        return Latent(agent=agents, global_=self.nets.initial_global(self.config))
 
     def encode(self, row: TimeStep) -> Inputs:
         """Encode actions, observations and the state of one row."""
@@ -60,6 +60,8 @@ class MABLSG(eqx.Module):
         h^a_t = f(h^a_{t-1}, z^a_{t-1}, a^i_{t-1}),   z^a_t ~ q(z^a_t | o^i_t, h^a_t) for each agent
         h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^{a,1..N}_t, h^g_t)
         """
+        if train and self.config.decoded_share:
+            latent = self._partly_decoded(latent, jax.random.fold_in(key, 0))
         latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
         key_agents, key_global = jax.random.split(key)
         keys = jax.random.split(key_agents, self.spec.n_agents)
@@ -67,8 +69,8 @@ class MABLSG(eqx.Module):
             latent.agent, prev_action, inputs.obs, keys
         )
         h = self.nets.global_recurrent(latent.global_, prev_action.ravel())
-        global_logits = self.nets.global_posterior(inputs.state, agent.z.ravel(), h)
-        global_ = Level(h, draw(global_logits, key_global))
+        global_logits = self.nets.global_posterior(inputs.state.code, agent.z.ravel(), h)
+        global_ = Level(h, draw(global_logits, key_global), inputs.state.row)
         return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
 
     def prior(self, latent: Latent, key: PRNGKey) -> tuple[Latent, dict[str, Array]]:
@@ -88,13 +90,26 @@ class MABLSG(eqx.Module):
         moved = Latent(latent.agent._replace(h=h_agent), latent.global_._replace(h=h_global))
         return still(self._transition(moved, key)[0])
 
+    def _partly_decoded(self, latent: Latent, key: PRNGKey) -> Latent:
+        """The latent with decoded rows at a share of the real ones (`decoded_share`)."""
+        share, (key_agents, key_global) = self.config.decoded_share, jax.random.split(key)
+
+        def agent(level: Level, key: PRNGKey) -> Level:
+            return partly_decoded(level, self.filter.decoder, share, key)
+
+        keys = jax.random.split(key_agents, self.spec.n_agents)
+        return Latent(
+            jax.vmap(agent)(latent.agent, keys),
+            partly_decoded(latent.global_, self.nets.state_decoder, share, key_global),
+        )
+
     def _transition(self, latent: Latent, key: PRNGKey) -> tuple[Latent, dict[str, Array]]:
         """Samples and logits given the deterministic parts of `latent`."""
         key_agents, key_global = jax.random.split(key)
         global_logits = self.nets.global_prior(latent.global_.h)
-        global_ = Level(latent.global_.h, draw(global_logits, key_global))
+        global_ = self.nets.imagined_global(latent.global_.h, draw(global_logits, key_global))
         agent_logits = self._agent_logits(latent.agent.h, global_)
-        agent = Level(latent.agent.h, draw(agent_logits, key_agents))
+        agent = jax.vmap(self.filter.imagined)(latent.agent.h, draw(agent_logits, key_agents))
         return Latent(agent, global_), {"agent": agent_logits, "global": global_logits}
 
     def _agent_logits(self, h: Float[Array, "N D"], team: Level) -> Float[Array, "N K C"]:
@@ -104,20 +119,16 @@ class MABLSG(eqx.Module):
 
     def predict(self, latent: Latent) -> Predictions:
         """Decode a row for every agent from its own level and the team's."""
-        return jax.vmap(self.nets.predict)(latent.agent, self._both(latent))
+        return jax.vmap(self.nets.predict, in_axes=(0, None))(latent.agent, latent.global_)
 
     def actor_features(self, latent: Latent) -> Features:
-        """Policy inputs: (z^a, h^a), and the decoded observation if there is a decoder."""
+        """Policy inputs: (z^a, h^a), or as `config.policy_input` says."""
         return jax.vmap(self.filter.features)(latent.agent)
 
     def critic_features(self, latent: Latent) -> Features:
-        """Critic inputs: both levels, and the decoded observation if there is a decoder."""
-        return *self._both(latent), *self.actor_features(latent)[2:]
-
-    def _both(self, latent: Latent) -> Features:
-        """Each agent's z^a and h^a beside the team's z^g and h^g."""
+        """Critic inputs: both levels, and what networks see of the row."""
         team = team_of(self.spec.n_agents, latent.global_)
-        return latent.agent.z, team.z, latent.agent.h, team.h
+        return jax.vmap(self.nets.critic_features)(latent.agent, team)
 
     def global_features(self, latent: Latent) -> Code:
         """z^g, the same for every agent."""

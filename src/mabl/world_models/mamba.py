@@ -28,11 +28,10 @@ from mabl.world_models.levels import (
     Categoricals,
     Level,
     forget,
-    policy_decoder,
     restored,
+    row_decoder,
     standardised,
     team_of,
-    with_decoded,
 )
 
 
@@ -115,7 +114,9 @@ class FilterNets(eqx.Module):
         )
         self.cell = GRU(hidden, hidden, keys[3])
         self.posterior = Categoricals((hidden, hidden), hidden, latent, keys[4], activation)
-        self.decoder = policy_decoder(config, spec.obs_dim, keys[5])
+        self.decoder = None
+        if config.filter_decodes:
+            self.decoder = row_decoder(config, spec.obs_dim, keys[5])
 
     def listen(
         self, latent: Latent, action: Float[Array, "N A"], key: PRNGKey | None
@@ -204,9 +205,12 @@ class JointFilter(eqx.Module):
 
     def features(self, memory: Latent) -> Features:
         """Policy inputs: (z_t, h_t), and the decoded observation if there is a decoder."""
-        return self.team.map(
-            lambda nets, level: with_decoded(level.features(), nets.decoder), memory.level
-        )
+
+        def one(nets: FilterNets, level: Level) -> Features:
+            decoded = () if nets.decoder is None else (nets.decoder(*level.features()),)
+            return *level.features(), *decoded
+
+        return self.team.map(one, memory.level)
 
 
 class DecoderNets(eqx.Module):
@@ -222,7 +226,7 @@ class DecoderNets(eqx.Module):
         self.heads = Heads(
             agent=(latent, hidden),
             full=(latent, hidden),
-            obs_dim=spec.obs_dim if config.policy_input == "latent" else None,
+            obs_dim=None if config.filter_decodes else spec.obs_dim,
             action_dim=spec.action_space.size,
             hidden=hidden,
             n_hidden=config.n_hidden,
@@ -252,6 +256,12 @@ class MAMBA(eqx.Module):
             raise UserError(
                 f"--world-model.hidden is {config.hidden}: give a multiple of the "
                 f"{communication.n_heads} --communication.n-heads"
+            )
+        if config.levels_hold_rows:
+            raise UserError(
+                "--world-model.policy-input observation and --world-model.recurrent-sees row are "
+                "not for mamba and mag, whose agents act on what they tell each other, which only "
+                "latents hold: give latent or decoded, and latent"
             )
         key_filter, key_decoders = jax.random.split(key)
         self.spec = spec

@@ -110,3 +110,9 @@ def obs_std(model: WorldModel) -> Float[Array, " O"] | float:
     """Standard deviations by which errors of observations are divided; 1 without scales."""
     scale = getattr(model.filter, "scale", None)
     return 1.0 if scale is None else jax.lax.stop_gradient(scale.moments()[1])
+
+
+def state_std(model: WorldModel) -> Float[Array, " S"] | float:
+    """Standard deviations by which errors of the state are divided; 1 without scales."""
+    scale = getattr(model, "state_scale", None)
+    return 1.0 if scale is None else jax.lax.stop_gradient(scale.moments()[1])
