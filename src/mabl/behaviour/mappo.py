@@ -140,7 +140,7 @@ class ActorCritic(NamedTuple):
 
 
 class ValueRows(NamedTuple):
-    """Joint rows of real experience, `[*b, N, ...]`: what the critic alone learns from."""
+    """Joint rows, real or imagined, `[*b, N, ...]`, as the critic learns from them."""
 
     view: TeamView
     target: Array
@@ -238,7 +238,7 @@ def optimisers(
 def experience(
     critic: ValueFunction, trajectory: Trajectory, config: MAPPOConfig
 ) -> tuple[PPORows, Metrics]:
-    """Lambda-returns and advantages of trajectories, flattened to joint rows."""
+    """Lambda-returns and advantages of trajectories, flattened to joint rows, start rows first."""
     weight, reward = trajectory.weight, shared_reward(trajectory.reward, config.team_reward)
     view = trajectory.view
     # Row by row of the horizon: the networks in between take more memory than all they see.
@@ -265,7 +265,7 @@ def experience(
         else advantage,
         target,
         weight,
-        weight if config.critic_rows == "all" else weight.at[1:].set(0.0),
+        weight,
     )
     return jax.tree.map(lambda x: rearrange(x, "h b ... -> (h b) ..."), rows), metrics
 
@@ -309,20 +309,25 @@ def update(
     update, estimated on one minibatch's actions (`kl_of_choices`).
     """
     rows, metrics = experience(state.value, trajectory, config)
-    returns = state.returns.update(rows.target, rows.value_weight, config.value_decay)
-    rows = rows._replace(target=returns.normalise(rows.target))
+    key_rows, key_replayed = jax.random.split(key)
+    batches = minibatches(key_rows, rows.target.shape[0], config.batch_size, config.n_epochs)
+    per_epoch = batches.shape[0] // config.n_epochs
+    imagined, imagined_batches = ValueRows(rows.view, rows.target, rows.value_weight), batches
+    if config.critic_rows == "starts":
+        n_starts = trajectory.weight.shape[1]
+        imagined = jax.tree.map(lambda x: x[:n_starts], imagined)
+        key_starts = jax.random.fold_in(key_rows, 0)
+        imagined_batches = divided(key_starts, n_starts, per_epoch, config.n_epochs)
+    returns = state.returns.update(imagined.target, imagined.value_weight, config.value_decay)
+    imagined = imagined._replace(target=returns.normalise(imagined.target))
+    real_batches = None
     if replayed is not None:
         replayed = replayed._replace(target=returns.normalise(replayed.target))
-    n_rows = rows.target.shape[0]
-    key_rows, key_replayed = jax.random.split(key)
-    batches = minibatches(key_rows, n_rows, config.batch_size, config.n_epochs)
-    if replayed is not None:
-        per_epoch = batches.shape[0] // config.n_epochs
         real_batches = divided(key_replayed, replayed.target.shape[0], per_epoch, config.n_epochs)
     actor_optimiser, critic_optimiser = optimisers(config)
 
     def critic_objective(
-        critic: Critic, batch: PPORows, replayed: ValueRows | None
+        critic: Critic, batch: ValueRows, replayed: ValueRows | None
     ) -> tuple[Float[Array, ""], Metrics]:
         loss, metrics = critic_loss(critic, batch, config.value_coef)
         if replayed is not None:
@@ -331,15 +336,15 @@ def update(
         return loss, metrics
 
     def minibatch(
-        state: ActorCritic, index: tuple[Array, Array | None]
+        state: ActorCritic, index: tuple[Array, Array, Array | None]
     ) -> tuple[ActorCritic, Metrics]:
-        batch = minibatch_of(rows, index[0])
-        real = None if index[1] is None else minibatch_of(replayed, index[1])
+        batch, of_critic = minibatch_of(rows, index[0]), minibatch_of(imagined, index[1])
+        real = None if index[2] is None else minibatch_of(replayed, index[2])
         actor_grad, actor_metrics = eqx.filter_grad(actor_loss, has_aux=True)(
             state.actor, batch, state.ent_coef, config.clip
         )
         critic_grad, critic_metrics = eqx.filter_grad(critic_objective, has_aux=True)(
-            state.critic, batch, real
+            state.critic, of_critic, real
         )
         actor_step, actor_opt = actor_optimiser.update(actor_grad, state.actor_opt, state.actor)  # pyright: ignore[reportArgumentType]
         critic_step, critic_opt = critic_optimiser.update(critic_grad, state.critic_opt)
@@ -353,9 +358,7 @@ def update(
         )
         return state, actor_metrics | critic_metrics
 
-    state, history = jax.lax.scan(
-        minibatch, state, (batches, None if replayed is None else real_batches)
-    )
+    state, history = jax.lax.scan(minibatch, state, (batches, imagined_batches, real_batches))
     return state, metrics | jax.tree.map(jnp.mean, history) | {
         "behaviour/ent_coef": state.ent_coef,
         "behaviour/update_kl": update_kl(state.actor, minibatch_of(rows, batches[0])),
