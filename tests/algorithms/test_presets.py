@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from mabl.algorithms.presets import BY_ALGORITHM, BY_ENV, preset
+from mabl.algorithms.presets import BY_ALGORITHM, BY_ENV, QUICK, preset
 from mabl.algorithms.registry import ALGORITHMS, make
 from mabl.envs import registry as envs
 from mabl.envs.base import Discrete, EnvSpec
@@ -30,7 +30,16 @@ def test_maps_and_algorithms_have_their_own(name, env, algo, learning_rate, rewa
 def test_maps_with_settings_of_their_own_exist():
     known = {row.name for row in envs.names()}
     assert {env for _, env in BY_ENV} <= known
-    assert {family for _, family, _ in BY_ALGORITHM} <= {name.split("/")[0] for name in known}
+    assert {family for _, family, _ in BY_ALGORITHM} <= QUICK.keys()
+
+
+def test_settings_for_an_algorithm_hold_for_families_that_have_none_of_their_own():
+    mamba = preset("quick", "smax/3m", "mamba").world_model
+    assert preset("quick", "smac/3m", "mamba").world_model == mamba
+    assert (mamba.policy_input, mamba.recurrent_sees) == ("decoded", "latent")
+    assert preset("quick", "flatland/5_agents", "mamba").world_model.policy_input == "latent"
+    mag = preset("quick", "flatland/5_agents", "mag")
+    assert mag.lookahead == preset("quick", "smax/3m", "mag").lookahead
 
 
 @pytest.mark.parametrize("name", ["quick", "efficient"])
@@ -52,11 +61,11 @@ def test_efficient_does_more_learning_for_each_step_in_world_models_alone():
             plan.policy_updates * algorithm.policy_gradient_steps / steps,
         )
 
-    # 18 updates of 320 rows for 256 rows collected; 8 policy updates of 5 epochs of 960 rows in
-    # minibatches of 240
-    assert learned("quick", "mabl") == (22.5, 160 / 256)
-    assert learned("efficient", "mabl") == (100.0, 160 / 256)
-    assert learned("efficient", "mamba") == (100.0, 160 / 256)
+    # 18 updates of 320 rows for 256 rows collected; 4 policy updates of 5 epochs of 3,200 rows in
+    # minibatches of 800
+    assert learned("quick", "mabl") == (22.5, 80 / 256)
+    assert learned("efficient", "mabl") == (100.0, 80 / 256)
+    assert learned("efficient", "mamba") == (100.0, 80 / 256)
     assert learned("efficient", "qmix") == learned("quick", "qmix") == (0.0, 16 / 256)
     assert learned("efficient", "mappo") == learned("quick", "mappo") == (0.0, 20 / 1024)
 

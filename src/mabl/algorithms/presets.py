@@ -51,7 +51,7 @@ _QUICK = {
             num_envs=16,
             collect_steps=16,
             model_updates=18,
-            policy_updates=8,
+            policy_updates=4,
             prefill_steps=2_000,
             pretrain_updates=500,
             replay_capacity=100_000,
@@ -64,7 +64,10 @@ _QUICK = {
             n_classes=8,
             activation="rms_silu",
             standardise=True,
-            policy_input="decoded",
+            policy_input="observation",
+            recurrent_sees="row",
+            decoded_share=0.5,
+            agent_identity=True,
             agent_prior_sees="level",
             averaging=0.99,
             obs_weight=4.0,
@@ -84,14 +87,14 @@ _QUICK = {
             actor_out_scale=0.01,
             actor_learning_rate=5e-4,
             critic_learning_rate=1e-3,
-            batch_size=240,
-            ent_coef=0.1,
+            batch_size=800,
+            ent_coef=0.03,
             ent_final=0.01,
             replay_value_coef=1.0,
             critic_rows="starts",
         ),
         imagination=ImaginationConfig(
-            horizon=4, sample_availability=False, sample_life=True, team_end=True
+            horizon=11, sample_availability=False, sample_life=True, team_end=True
         ),
     ),
     "test": Config(
@@ -143,6 +146,9 @@ _FINE = replace(
     activation="relu",
     standardise=False,
     policy_input="latent",
+    recurrent_sees="latent",
+    decoded_share=0.0,
+    agent_identity=False,
     agent_prior_sees="sample",
     averaging=0.0,
     outcomes="row",
@@ -260,6 +266,11 @@ _MAMBA_TEST = {
     "communication": {"n_layers": 1},
     "mappo": {"ent_coef": 0.3},
 }
+# What agents tell each other is in their latents alone, which policies therefore see.
+_LATENT_POLICY = {
+    "world_model": {"policy_input": "decoded", "recurrent_sees": "latent", "decoded_share": 0.0}
+}
+_QUICK_LOOKAHEAD = {"lookahead": {"steps": 3, "hidden": 128, "n_hidden": 2}}
 # No model to train, and no rows kept beyond a cycle's.
 _ON_POLICY = {"model_updates": 0, "policy_updates": 1, "prefill_steps": 0, "pretrain_updates": 0}
 
@@ -278,7 +289,13 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
     ("paper", "test", "mappo"): {"training": _RECIPE},
     ("paper", "smax", "qmix"): {"training": _OFF_POLICY},
     ("paper", "test", "qmix"): {"training": _OFF_POLICY},
-    ("quick", "smax", "mag"): {"lookahead": {"steps": 3, "hidden": 128, "n_hidden": 2}},
+    ("quick", "smax", "mamba"): _LATENT_POLICY,
+    ("quick", "smax", "mag"): _LATENT_POLICY | _QUICK_LOOKAHEAD,
+    **{
+        ("quick", family, algo): changes
+        for family in ("flatland", "mamujoco", "pettingzoo")
+        for algo, changes in (("mamba", {}), ("mag", _QUICK_LOOKAHEAD))
+    },
     ("quick", "smax", "mappo"): {
         "precision": "float32",
         "training": _ON_POLICY | {"num_envs": 16, "collect_steps": 64, "replay_capacity": 1_024},
@@ -339,7 +356,7 @@ BY_ALGORITHM: dict[tuple[str, str, str], dict[str, Any]] = {
 KIN: dict[str, str] = dict.fromkeys(
     ("smac", "smacv2", "flatland", "mamujoco", "pettingzoo"), "smax"
 )
-"""Families in which algorithms are changed like in another."""
+"""Families in which algorithms that have no entry of their own are changed like in another."""
 
 
 def preset(name: str, env: str, algo: str) -> Config:
@@ -360,7 +377,8 @@ def preset(name: str, env: str, algo: str) -> Config:
             )
         raise registry.unknown(env)
     config = replace(families[family], env=env, algo=algo)
-    by_family = BY_ALGORITHM.get((INHERITED.get(name, name), KIN.get(family, family), algo), {})
+    own = (INHERITED.get(name, name), family, algo)
+    by_family = BY_ALGORITHM.get(own, BY_ALGORITHM.get((own[0], KIN.get(family, family), algo), {}))
     for changes in (BY_ENV.get((name, env), {}), by_family):
         for field, new in changes.items():
             value = replace(getattr(config, field), **new) if isinstance(new, dict) else new
