@@ -10,6 +10,7 @@ from tests.tiny import flags
 from mabl import cli
 from mabl.runs.checkpoint import Checkpoints
 from mabl.runs.lock import writing
+from mabl.runs.metrics import NOT_SCORES, read, score_name
 
 ENV = "test/coordination"
 
@@ -29,6 +30,17 @@ def run(whole, tmp_path):
     """A copy of it."""
     shutil.copytree(whole, tmp_path / "run")
     return tmp_path / "run"
+
+
+def test_the_score_is_told_from_all_else_that_runs_log(whole):
+    """Also in runs whose first cycles ended no episode, as of long episodes."""
+    rows = read(whole)
+    names = {name.removeprefix("train/") for row in rows for name in row if "train/" in name}
+    assert names - set(NOT_SCORES) == {"score"} and set(NOT_SCORES) < names
+    ended = ("train/score", "train/episode_return", "train/episode_length")
+    none = {name: value for name, value in rows[0].items() if name not in ended}
+    assert score_name([none, none]) is None
+    assert score_name([none, rows[-1]]) == "score"
 
 
 def test_one_process_writes_and_others_read(run, mabl):

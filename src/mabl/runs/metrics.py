@@ -17,7 +17,15 @@ from mabl.runs.files import flush_to_disk, replace_file
 
 Row = dict[str, float]
 
-NOT_SCORES = ("episodes", "episode_return", "episode_length", "skipped_updates", "imagined_steps")
+NOT_SCORES = (
+    "episodes",
+    "episode_return",
+    "episode_length",
+    "skipped_updates",
+    "imagined_steps",
+    "replayed_rows_per_env_step",
+    "policy_gradient_steps_per_env_step",
+)
 """What rows say under `train/` beside the environment's score."""
 
 
