@@ -1,6 +1,7 @@
 """Every algorithm at a size at which a test can afford it."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -45,31 +46,46 @@ SIZES = {
     },
 }
 LEARNING_STARTS = {"prefill_steps": 100, "pretrain_updates": 3}
+ROWS = {
+    "policy_input": "observation",
+    "recurrent_sees": "row",
+    "decoded_share": 0.5,
+    "agent_identity": True,
+}
+"""As `quick` has them on SMAX."""
+WITH_ROWS = ("mabl-sg", "mabl-qmix")
+"""Algorithms that are tried with them; the others are tried without."""
+
+
+def sizes_of(algo: str) -> dict[str, dict[str, Any]]:
+    """Fields that are changed in the sections that `algo` reads."""
+    sizes = {name: dict(SIZES[name]) for name in entry(algo).sections}
+    if "world_model" in sizes:
+        sizes["training"] |= LEARNING_STARTS
+    else:
+        sizes["training"] |= {"model_updates": 0, "prefill_steps": 0}
+    if algo in WITH_ROWS:
+        sizes["world_model"] |= ROWS
+    return sizes
 
 
 def tiny(algo: str, env: str = "test/coordination") -> Config:
     """The `quick` preset of a test environment, made tiny in the sections that `algo` reads."""
     config = preset("quick", env, algo)
-    sections = {name: SIZES[name] for name in entry(algo).sections}
-    if "world_model" in sections:
-        sections["training"] = sections["training"] | LEARNING_STARTS
-    else:
-        sections["training"] = sections["training"] | {"model_updates": 0, "prefill_steps": 0}
     return replace(
-        config, **{name: replace(getattr(config, name), **new) for name, new in sections.items()}
+        config,
+        **{name: replace(getattr(config, name), **new) for name, new in sizes_of(algo).items()},
     )
 
 
 def flags(algo: str, env: str) -> list[str]:
     """The same as flags of `mabl train`."""
     config, given = tiny(algo, env), [f"--algo={algo}", f"--env={env}"]
-    for name in entry(algo).sections:
+    for name, changed in sizes_of(algo).items():
         section = getattr(config, name)
-        changed = SIZES[name] | (LEARNING_STARTS if name == "training" else {})
-        given += [
-            f"--{section.FLAG_PREFIX}{field.replace('_', '-')}={getattr(section, field)}"
-            for field in changed
-        ]
+        for field, value in changed.items():
+            flag = f"--{section.FLAG_PREFIX}{field.replace('_', '-')}"
+            given.append(flag if value is True else f"{flag}={value}")
     return given
 
 

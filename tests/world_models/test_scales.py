@@ -58,9 +58,16 @@ def test_latents_and_losses_do_not_depend_on_units_and_predictions_are_in_them(m
     assert_allclose(plain[2], scaled[2], rtol=1e-3)
 
 
-@pytest.mark.parametrize("make", MODELS)
-def test_every_parameter_is_trained_and_no_scale(make):
+@pytest.mark.parametrize(
+    ("make", "options"),
+    [
+        *((make, {}) for make in MODELS),
+        *((make, {"policy_input": "observation", "recurrent_sees": "row"}) for make in MODELS[:3]),
+    ],
+)
+def test_every_parameter_is_trained_and_no_scale(make, options):
     config = replace(SCALED, outcomes="transition", reward_input="both", overshooting=1.0)
+    config = replace(config, **options)
     rows = rows_in(1.0, 0.0, 6)
     rows = rows._replace(obs=rows.obs * 3.0)
     model = with_scales(make(SPEC, config, jax.random.key(0)), rows)

@@ -309,14 +309,13 @@ def update(
     update, estimated on one minibatch's actions (`kl_of_choices`).
     """
     rows, metrics = experience(state.value, trajectory, config)
-    key_rows, key_replayed = jax.random.split(key)
+    key_rows, key_replayed, key_starts = jax.random.split(key, 3)
     batches = minibatches(key_rows, rows.target.shape[0], config.batch_size, config.n_epochs)
     per_epoch = batches.shape[0] // config.n_epochs
     imagined, imagined_batches = ValueRows(rows.view, rows.target, rows.value_weight), batches
     if config.critic_rows == "starts":
         n_starts = trajectory.weight.shape[1]
         imagined = jax.tree.map(lambda x: x[:n_starts], imagined)
-        key_starts = jax.random.fold_in(key_rows, 0)
         imagined_batches = divided(key_starts, n_starts, per_epoch, config.n_epochs)
     returns = state.returns.update(imagined.target, imagined.value_weight, config.value_decay)
     imagined = imagined._replace(target=returns.normalise(imagined.target))

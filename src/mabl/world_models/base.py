@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 from jaxtyping import Array, Bool, Float
 
-from mabl.errors import require_between, require_positive
+from mabl.errors import UserError, require_between, require_positive
 from mabl.nets.categorical import CodeShape
 from mabl.nets.mlp import Activation, Features
 from mabl.rows import TimeStep
@@ -44,20 +44,21 @@ class WorldModelConfig:
     """Hidden layers of all networks: `relu` as in the paper (appendix B.1), or `rms_silu`: RMS
     normalisation and SiLU, as in DreamerV3."""
     standardise: bool = False
-    """Standardise observations and states by their running mean and variance, for encoders and for
-    the observations' loss."""
+    """Standardise observations and states by their running mean and variance: for encoders, for
+    policies and recurrent models that see them, and for the losses of what decodes them."""
     policy_input: Literal["latent", "decoded", "observation"] = "latent"
     """Input of policies: the latent (z, h) as in the paper; the latent and the observation decoded
     from it; or the observation alone, which is the real one at real rows and decoded at imagined
-    ones, so that policies have no memory. Critics see the latent, and the observation if policies
-    do."""
+    ones, so that policies have no memory. MAPPO's critics see the latents, the observation if
+    policies do, and the state where global levels hold it."""
     recurrent_sees: Literal["latent", "row"] = "latent"
     """Input of recurrent models beside the action: z of the row before as in the paper, or also
     what the level encodes of that row: the observation, or the state. Imagined rows have decoded
     ones (ADR 26)."""
     decoded_share: float = 0.0
-    """Share of real rows of which recurrent models that see rows are trained on decoded ones, as
-    in imagination."""
+    """Probability, at each real row in training, that recurrent models see the decoded row in place
+    of the real one, as in imagination; needs `recurrent_sees=row`. All losses of later rows then
+    also train the decoders."""
     obs_weight: float = 1.0
     """Weight of the observations' loss."""
     state_weight: float = 1.0
@@ -132,6 +133,11 @@ class WorldModelConfig:
         require_between(self, 0, inf, "free_nats", "obs_weight", "state_weight", "overshooting")
         require_between(self, 0, inf, "reward_weight", "agent_reward_weight", "end_weight")
         require_between(self, 0, inf, "absorbing")
+        if self.decoded_share and self.recurrent_sees != "row":
+            raise UserError(
+                f"--world-model.decoded-share is {self.decoded_share}, and recurrent models see no "
+                "rows: give 0, or --world-model.recurrent-sees row"
+            )
 
 
 class WorldModel(Protocol[L]):

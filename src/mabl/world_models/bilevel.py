@@ -21,6 +21,7 @@ from mabl.world_models.levels import (
     Embedded,
     Level,
     Recurrent,
+    partly_decoded,
     restored,
     row_decoder,
     standardised,
@@ -77,7 +78,7 @@ class BiLevel(eqx.Module):
             joint_dim: width of the joint action that the global level sees.
             identity_dim: width of the one-hot index that agent priors see; 0 if they see none.
         """
-        keys = jax.random.split(key, 7)
+        keys = jax.random.split(key, 8)
         hidden, latent = config.hidden, config.latent
         action_dim = spec.action_space.size
         self.filter = AgentFilter(spec, config, keys[0])
@@ -90,8 +91,7 @@ class BiLevel(eqx.Module):
         )
         self.state_decoder = None
         if self.state_dim:
-            key_state = jax.random.fold_in(key, 0)
-            self.state_decoder = row_decoder(config, spec.state_dim, key_state)
+            self.state_decoder = row_decoder(config, spec.state_dim, keys[7])
         seen = latent._replace(n_categoricals=n_seen * latent.n_categoricals)
         self.global_posterior = Categoricals(
             (hidden, seen, hidden), hidden, latent, keys[3], activation
@@ -133,7 +133,11 @@ class BiLevel(eqx.Module):
         level = Level(h, z)
         if self.state_decoder is None:
             return level
-        return level._replace(row=self.state_decoder(*level.features()))
+        return level._replace(row=jax.lax.stop_gradient(self.state_decoder(*level.features())))
+
+    def partly_decoded_global(self, level: Level, key: PRNGKey) -> Level:
+        """A global level as its recurrent model is trained on it (`decoded_share`)."""
+        return partly_decoded(level, self.state_decoder, self.filter.decoded_share, key)
 
     def predict(self, agent: Level, global_: Level) -> Predictions:
         """One agent's predictions of a row, in the environment's units."""

@@ -19,7 +19,6 @@ from mabl.world_models.levels import (
     Embedded,
     Level,
     forget,
-    partly_decoded,
     restored,
     team_of,
 )
@@ -43,12 +42,11 @@ class DreamerV2(eqx.Module):
     agent_prior: Categoricals
     heads: Heads
     spec: EnvSpec = eqx.field(static=True)
-    decoded_share: float = eqx.field(static=True)
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
         keys = jax.random.split(key, 3)
         hidden, latent = config.hidden, config.latent
-        self.spec, self.decoded_share = spec, config.decoded_share
+        self.spec = spec
         self.filter = AgentFilter(spec, config, keys[0])
         self.agent_prior = Categoricals((hidden,), hidden, latent, keys[1], config.activation)
         self.heads = Heads(
@@ -80,8 +78,10 @@ class DreamerV2(eqx.Module):
         self, latent: Level, inputs: Inputs, key: PRNGKey, train: bool = False
     ) -> tuple[Level, dict[str, Float[Array, "N K C"]]]:
         """h_t = f(h_{t-1}, z_{t-1}, a^i_{t-1}), z_t ~ q(z_t | o^i_t, h_t) of every agent."""
-        if train and self.decoded_share:
-            latent = self._partly_decoded(latent, jax.random.fold_in(key, 0))
+        if train:
+            key, key_rows = jax.random.split(key)
+            keys = jax.random.split(key_rows, self.spec.n_agents)
+            latent = jax.vmap(self.filter.partly_decoded)(latent, keys)
         latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
         keys = jax.random.split(key, self.spec.n_agents)
         latent, logits = jax.vmap(self.filter.infer)(latent, prev_action, inputs.obs, keys)
@@ -107,14 +107,6 @@ class DreamerV2(eqx.Module):
             return predicted._replace(obs=restored(predicted.obs, self.filter.scale))
 
         return jax.vmap(decode)(latent)
-
-    def _partly_decoded(self, latent: Level, key: PRNGKey) -> Level:
-        """Decoded observations at a share of the real rows (`decoded_share`)."""
-
-        def agent(level: Level, key: PRNGKey) -> Level:
-            return partly_decoded(level, self.filter.decoder, self.decoded_share, key)
-
-        return jax.vmap(agent)(latent, jax.random.split(key, self.spec.n_agents))
 
     def actor_features(self, latent: Level) -> Features:
         """Policy inputs: (z, h), or as `WorldModelConfig.policy_input` says."""

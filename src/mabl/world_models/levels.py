@@ -180,11 +180,13 @@ class AgentFilter(eqx.Module):
     hidden: int = eqx.field(static=True)
     policy_input: str = eqx.field(static=True)
     holds_row: bool = eqx.field(static=True)
+    decoded_share: float = eqx.field(static=True)
 
     def __init__(self, spec: EnvSpec, config: WorldModelConfig, key: PRNGKey):
         hidden, latent, activation = config.hidden, config.latent, config.activation
         self.obs_dim, self.hidden, self.latent = spec.obs_dim, hidden, latent
         self.policy_input, self.holds_row = config.policy_input, config.levels_hold_rows
+        self.decoded_share = config.decoded_share
         self.scale = Normaliser.fresh(spec.obs_dim) if config.standardise else None
         key_own, key_decoder = jax.random.split(key)
         key_encoder, key_recurrent, key_posterior = jax.random.split(key_own, 3)
@@ -226,7 +228,13 @@ class AgentFilter(eqx.Module):
     def imagined(self, h: Float[Array, " D"], z: Code) -> Level:
         """The latent of an imagined row, with the decoded observation if levels hold rows."""
         level = Level(h, z)
-        return level._replace(row=self.decoded(level)[0]) if self.holds_row else level
+        if not self.holds_row:
+            return level
+        return level._replace(row=jax.lax.stop_gradient(self.decoded(level)[0]))
+
+    def partly_decoded(self, level: Level, key: PRNGKey) -> Level:
+        """One agent's latent as recurrent models are trained on it (`decoded_share`)."""
+        return partly_decoded(level, self.decoder, self.decoded_share, key)
 
     def __call__(
         self, level: Level, prev_action: Float[Array, " A"], obs: Float[Array, " O"], key: PRNGKey

@@ -18,7 +18,6 @@ from mabl.world_models.levels import (
     Embedded,
     Level,
     forget,
-    partly_decoded,
     team_of,
 )
 
@@ -67,8 +66,9 @@ class MABL(eqx.Module):
         h^a_t = f(h^a_{t-1}, z^a_{t-1}, a^i_{t-1}),   z^a_t ~ q(z^a_t | o^i_t, h^a_t)
         h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^a_t, h^g_t)
         """
-        if train and self.config.decoded_share:
-            keys = jax.random.split(jax.random.fold_in(key, 0), self.spec.n_agents)
+        if train:
+            key, key_rows = jax.random.split(key)
+            keys = jax.random.split(key_rows, self.spec.n_agents)
             latent = jax.vmap(self._partly_decoded)(latent, keys)
         latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
 
@@ -132,10 +132,10 @@ class MABL(eqx.Module):
 
     def _partly_decoded(self, latent: Latent, key: PRNGKey) -> Latent:
         """One agent's latent with decoded rows at a share of the real ones (`decoded_share`)."""
-        share, (key_agent, key_global) = self.config.decoded_share, jax.random.split(key)
+        key_agent, key_global = jax.random.split(key)
         return Latent(
-            partly_decoded(latent.agent, self.filter.decoder, share, key_agent),
-            partly_decoded(latent.global_, self.nets.state_decoder, share, key_global),
+            self.filter.partly_decoded(latent.agent, key_agent),
+            self.nets.partly_decoded_global(latent.global_, key_global),
         )
 
     def _transition(

@@ -14,7 +14,7 @@ from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.bilevel import BiLevel, Inputs, Latent
 from mabl.world_models.heads import Predictions
-from mabl.world_models.levels import AgentFilter, Level, forget, partly_decoded, team_of
+from mabl.world_models.levels import AgentFilter, Level, forget, team_of
 
 
 class MABLSG(eqx.Module):
@@ -60,8 +60,9 @@ class MABLSG(eqx.Module):
         h^a_t = f(h^a_{t-1}, z^a_{t-1}, a^i_{t-1}),   z^a_t ~ q(z^a_t | o^i_t, h^a_t) for each agent
         h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^{a,1..N}_t, h^g_t)
         """
-        if train and self.config.decoded_share:
-            latent = self._partly_decoded(latent, jax.random.fold_in(key, 0))
+        if train:
+            key, key_rows = jax.random.split(key)
+            latent = self._partly_decoded(latent, key_rows)
         latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
         key_agents, key_global = jax.random.split(key)
         keys = jax.random.split(key_agents, self.spec.n_agents)
@@ -92,15 +93,11 @@ class MABLSG(eqx.Module):
 
     def _partly_decoded(self, latent: Latent, key: PRNGKey) -> Latent:
         """The latent with decoded rows at a share of the real ones (`decoded_share`)."""
-        share, (key_agents, key_global) = self.config.decoded_share, jax.random.split(key)
-
-        def agent(level: Level, key: PRNGKey) -> Level:
-            return partly_decoded(level, self.filter.decoder, share, key)
-
+        key_agents, key_global = jax.random.split(key)
         keys = jax.random.split(key_agents, self.spec.n_agents)
         return Latent(
-            jax.vmap(agent)(latent.agent, keys),
-            partly_decoded(latent.global_, self.nets.state_decoder, share, key_global),
+            jax.vmap(self.filter.partly_decoded)(latent.agent, keys),
+            self.nets.partly_decoded_global(latent.global_, key_global),
         )
 
     def _transition(self, latent: Latent, key: PRNGKey) -> tuple[Latent, dict[str, Array]]:
