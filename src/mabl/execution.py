@@ -105,7 +105,7 @@ def act_alone(
     """One agent, one step, on its own: nothing of its teammates or of the state can get in.
 
     With a world model's filter: a_t ~ pi(a_t | z_t, h_t), inferred from o_t, h_{t-1}, z_{t-1},
-    a_{t-1}.
+    a_{t-1}; or what `WorldModelConfig.policy_input` says in place of (z_t, h_t).
     """
     key_latent, key_action = jax.random.split(key)
     memory, encoded = forget((memory, action_space.encode(prev_action)), is_first)

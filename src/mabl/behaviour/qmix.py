@@ -67,7 +67,10 @@ class QMIXConfig:
 
 
 class EpsilonGreedy(eqx.Module):
-    """Agent i's policy: the best action of Q_i(z_agent, h_agent), or with epsilon any available."""
+    """Agent i's policy: the best action of Q_i(z_agent, h_agent), or with epsilon any available.
+
+    Q_i sees what `WorldModelConfig.policy_input` says.
+    """
 
     q: MLP
     epsilon: Float[Array, ""]
