@@ -243,15 +243,6 @@ def test_what_is_imagined_past_an_end_trains_no_decoder_and_no_prior(make):
     assert all(any(np.abs(x).max() > 0 for x in jax.tree.leaves(part)) for part in moved)
 
 
-@pytest.mark.parametrize(("config", "counts"), [(DECODED, False), (OBSERVED, True), (ROWS, True)])
-def test_observations_of_the_dead_count_where_networks_see_decoded_ones(config, counts):
-    model, rows = MABL(SPEC, config, jax.random.key(0)), some_rows(2)
-    rows = rows._replace(alive=rows.alive.at[:, 1].set(False), obs=rows.obs.at[:, 1].set(0.0))
-    predicted = jax.vmap(model.predict)(latents_of(model, rows))
-    losses = decoder_losses(predicted, rows, config, SPEC.action_space)["obs"]
-    assert (losses[:, 0] > 0).all() and (losses[:, 1] > 0).all() == counts
-
-
 @pytest.mark.parametrize("make", LEVELS)
 def test_the_filter_alone_infers_what_training_infers(make):
     """Also across a reset. Samples, whose keys differ, are those of training."""

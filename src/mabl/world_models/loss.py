@@ -151,18 +151,16 @@ def decoder_losses(
 
     -log p(o^i | z^a, h^a), -log p(r^i | z^a, h^a), and -log p(. | z^a, z^g, h^a, h^g) of
     termination, availability and the action a^i_{t-1} (sections 3.1.2 and 3.2), and of life
-    (ADR 9), and of the state where it is decoded. Actions of the dead do not count, nor their
-    observations unless networks see decoded ones, nor the action before a first row, nor wins on
-    rows that do not end an episode. Errors of observations and of the state are in units of
-    `obs_std` and `state_std`, by feature.
+    (ADR 9), and of the state where it is decoded. Observations and actions of the dead do not
+    count, nor the action before a first row, nor wins on rows that do not end an episode. Errors of
+    observations and of the state are in units of `obs_std` and `state_std`, by feature.
     """
     alive = rows.alive.astype(jnp.float32)
     acted = alive * ~rows.is_first[..., None]
-    shown = jnp.ones_like(alive) if config.levels_hold_rows else alive
     std = jnp.broadcast_to(obs_std, rows.obs.shape)
     losses = {
         "obs": config.obs_weight
-        * (shown * optax.huber_loss(predicted.obs / std, rows.obs / std).sum(-1)),
+        * (alive * optax.huber_loss(predicted.obs / std, rows.obs / std).sum(-1)),
         "reward": config.reward_weight
         * reward_loss(predicted.reward, rows.reward, config.reward_loss),
         "terminated": config.end_weight
