@@ -46,12 +46,7 @@ SIZES = {
     },
 }
 LEARNING_STARTS = {"prefill_steps": 100, "pretrain_updates": 3}
-ROWS = {
-    "policy_input": "observation",
-    "recurrent_sees": "row",
-    "decoded_share": 0.5,
-    "agent_identity": True,
-}
+ROWS = {"policy_input": "observation", "recurrent_sees": "row", "decoded_share": 0.5}
 """As `quick` has them on SMAX."""
 WITH_ROWS = ("mabl-sg", "mabl-qmix")
 """Algorithms that are tried with them; the others are tried without."""

@@ -452,7 +452,9 @@ def test_the_value_is_that_of_the_best_of_all_available_joint_actions(bandit):
 
 
 def test_learning_in_imagination_leaves_the_world_model_alone():
-    training: Training = build(tiny("mabl-qmix"))
+    config = tiny("mabl-qmix")
+    model = replace(config.world_model, policy_input="latent")
+    training: Training = build(replace(config, world_model=model))
     state = jax.jit(training.init)(jax.random.key(0))
 
     @jax.jit

@@ -78,7 +78,7 @@ class DreamerV2(eqx.Module):
         self, latent: Level, inputs: Inputs, key: PRNGKey, train: bool = False
     ) -> tuple[Level, dict[str, Float[Array, "N K C"]]]:
         """h_t = f(h_{t-1}, z_{t-1}, a^i_{t-1}), z_t ~ q(z_t | o^i_t, h_t) of every agent."""
-        if train:
+        if train and self.filter.decoded_share:
             key, key_rows = jax.random.split(key)
             keys = jax.random.split(key_rows, self.spec.n_agents)
             latent = jax.vmap(self.filter.partly_decoded)(latent, keys)

@@ -66,7 +66,7 @@ class MABL(eqx.Module):
         h^a_t = f(h^a_{t-1}, z^a_{t-1}, a^i_{t-1}),   z^a_t ~ q(z^a_t | o^i_t, h^a_t)
         h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^a_t, h^g_t)
         """
-        if train:
+        if train and self.filter.decoded_share:
             key, key_rows = jax.random.split(key)
             keys = jax.random.split(key_rows, self.spec.n_agents)
             latent = jax.vmap(self._partly_decoded)(latent, keys)

@@ -60,7 +60,7 @@ class MABLSG(eqx.Module):
         h^a_t = f(h^a_{t-1}, z^a_{t-1}, a^i_{t-1}),   z^a_t ~ q(z^a_t | o^i_t, h^a_t) for each agent
         h^g_t = f(h^g_{t-1}, z^g_{t-1}, a_{t-1}),     z^g_t ~ q(z^g_t | s_t, z^{a,1..N}_t, h^g_t)
         """
-        if train:
+        if train and self.filter.decoded_share:
             key, key_rows = jax.random.split(key)
             latent = self._partly_decoded(latent, key_rows)
         latent, prev_action = forget((latent, inputs.prev_action), inputs.is_first)
