@@ -32,7 +32,7 @@ def mean_between(record: Record, values: NDArray[np.floating], low: int, high: i
 
 
 def row_of(record: Record, at: list[int]) -> dict[str, Any]:
-    """What is kept of one run."""
+    """Summarise one run as one row."""
     task, algorithm, seed = record.key
     row: dict[str, Any] = {
         "env": task,

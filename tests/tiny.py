@@ -78,9 +78,10 @@ def flags(algo: str, env: str) -> list[str]:
     config, given = tiny(algo, env), [f"--algo={algo}", f"--env={env}"]
     for name, changed in sizes_of(algo).items():
         section = getattr(config, name)
-        for field, value in changed.items():
-            flag = f"--{section.FLAG_PREFIX}{field.replace('_', '-')}"
-            given.append(flag if value is True else f"{flag}={value}")
+        given += [
+            f"--{section.FLAG_PREFIX}{field.replace('_', '-')}={value}"
+            for field, value in changed.items()
+        ]
     return given
 
 

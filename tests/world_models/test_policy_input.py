@@ -1,4 +1,4 @@
-"""What policies and recurrent models see of rows: values, gradients, dependence on teammates."""
+"""Inputs of policies and recurrent models from rows: values, gradients, decentralisation."""
 
 from dataclasses import replace
 
@@ -223,7 +223,7 @@ def test_in_training_recurrent_models_see_decoded_rows_at_a_share_of_the_real_on
 
 @pytest.mark.parametrize("make", LEVELS)
 def test_what_is_imagined_past_an_end_trains_no_decoder_and_no_prior(make):
-    """Nothing is learned through imagined codes, nor through the rows that they decode to."""
+    """Check that gradients stop at imagined codes and at the rows that they decode to."""
     config = replace(ROWS, decoded_share=0.0, outcomes="transition", absorbing=2)
     model = make(SPEC, config, jax.random.key(0))
     rows = some_rows(4)._replace(terminated=jnp.zeros((4, 3), bool).at[2].set(True))

@@ -266,7 +266,7 @@ _MAMBA_TEST = {
     "communication": {"n_layers": 1},
     "mappo": {"ent_coef": 0.3},
 }
-# What agents tell each other is in their latents alone, which policies therefore see.
+# Agents that communicate need policies that see the latent, which alone holds the messages.
 _LATENT_POLICY = {
     "world_model": {"policy_input": "decoded", "recurrent_sees": "latent", "decoded_share": 0.0}
 }
@@ -377,8 +377,9 @@ def preset(name: str, env: str, algo: str) -> Config:
             )
         raise registry.unknown(env)
     config = replace(families[family], env=env, algo=algo)
-    own = (INHERITED.get(name, name), family, algo)
-    by_family = BY_ALGORITHM.get(own, BY_ALGORITHM.get((own[0], KIN.get(family, family), algo), {}))
+    base = INHERITED.get(name, name)
+    own, kin = ((base, of, algo) for of in (family, KIN.get(family, family)))
+    by_family = BY_ALGORITHM.get(own, BY_ALGORITHM.get(kin, {}))
     for changes in (BY_ENV.get((name, env), {}), by_family):
         for field, new in changes.items():
             value = replace(getattr(config, field), **new) if isinstance(new, dict) else new

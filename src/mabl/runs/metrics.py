@@ -26,7 +26,7 @@ NOT_SCORES = (
     "replayed_rows_per_env_step",
     "policy_gradient_steps_per_env_step",
 )
-"""What rows say under `train/` beside the environment's score."""
+"""Names under `train/` that are not the environment's score."""
 
 
 class MetricsLog:

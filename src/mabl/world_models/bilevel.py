@@ -124,12 +124,13 @@ class BiLevel(eqx.Module):
         above = global_.features() if self.agent_prior_sees == "level" else (global_.z,)
         return self.agent_prior(h, *above, *identity)
 
-    def initial_global(self, config: WorldModelConfig) -> Level:
+    def initial_global(self) -> Level:
         """A global level before an episode's first row: zeros."""
-        return Level.none(config.hidden, config.latent, self.state_dim)
+        return Level.none(self.filter.hidden, self.filter.latent, self.state_dim)
 
     def imagined_global(self, h: Float[Array, " D"], z: Code) -> Level:
-        """A global level of an imagined row, with the decoded state if levels hold rows."""
+        """A global level of an imagined row, with the decoded state if levels hold rows; no
+        gradient flows through that state."""
         level = Level(h, z)
         if self.state_decoder is None:
             return level

@@ -226,7 +226,8 @@ class AgentFilter(eqx.Module):
         return Level(h, draw(logits, key), obs.row), logits
 
     def imagined(self, h: Float[Array, " D"], z: Code) -> Level:
-        """The latent of an imagined row, with the decoded observation if levels hold rows."""
+        """The latent of an imagined row, with the decoded observation if levels hold rows; no
+        gradient flows through that observation."""
         level = Level(h, z)
         if not self.holds_row:
             return level

@@ -13,13 +13,7 @@ from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModelConfig
 from mabl.world_models.bilevel import BiLevel, Inputs, Latent, own_first
 from mabl.world_models.heads import Predictions
-from mabl.world_models.levels import (
-    AgentFilter,
-    Embedded,
-    Level,
-    forget,
-    team_of,
-)
+from mabl.world_models.levels import AgentFilter, Embedded, Level, forget, team_of
 
 
 class MABL(eqx.Module):
@@ -51,7 +45,7 @@ class MABL(eqx.Module):
 
     def initial(self) -> Latent:
         """The team's latent before an episode's first row: zeros."""
-        level = Latent(self.filter.learning(), self.nets.initial_global(self.config))
+        level = Latent(self.filter.learning(), self.nets.initial_global())
         return team_of(self.spec.n_agents, level)
 
     def encode(self, row: TimeStep) -> Inputs:

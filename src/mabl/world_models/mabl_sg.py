@@ -46,7 +46,7 @@ class MABLSG(eqx.Module):
     def initial(self) -> Latent:
         """The latents before an episode's first row: zeros."""
         agents = team_of(self.spec.n_agents, self.filter.learning())
-        return Latent(agent=agents, global_=self.nets.initial_global(self.config))
+        return Latent(agent=agents, global_=self.nets.initial_global())
 
     def encode(self, row: TimeStep) -> Inputs:
         """Encode actions, observations and the state of one row."""

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mabl.nets.normaliser import Normaliser
 from mabl.rows import TimeStep
 from mabl.types import PRNGKey
 from mabl.world_models.base import WorldModel, WorldModelConfig
@@ -106,13 +107,16 @@ def with_scales(model: M, rows: TimeStep) -> M:
     return model
 
 
-def obs_std(model: WorldModel) -> Float[Array, " O"] | float:
-    """Standard deviations by which errors of observations are divided; 1 without scales."""
-    scale = getattr(model.filter, "scale", None)
+def std_of(scale: Normaliser | None) -> Float[Array, " F"] | float:
+    """Standard deviations by which errors are divided; 1 without a scale. They are not trained."""
     return 1.0 if scale is None else jax.lax.stop_gradient(scale.moments()[1])
+
+
+def obs_std(model: WorldModel) -> Float[Array, " O"] | float:
+    """Standard deviations of observations."""
+    return std_of(getattr(model.filter, "scale", None))
 
 
 def state_std(model: WorldModel) -> Float[Array, " S"] | float:
-    """Standard deviations by which errors of the state are divided; 1 without scales."""
-    scale = getattr(model, "state_scale", None)
-    return 1.0 if scale is None else jax.lax.stop_gradient(scale.moments()[1])
+    """Standard deviations of the state; 1 also for models that do not see it."""
+    return std_of(getattr(model, "state_scale", None))
