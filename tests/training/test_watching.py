@@ -46,3 +46,10 @@ def test_a_global_latent_without_information_is_told_once():
     assert step == 10_000 and "global latent carries no information" in warning
     assert told([IDLE] * 15 + [{"world_model/kl_global": 0.2}] + [IDLE] * 15) == []
     assert told([{"world_model/kl_agent": 0.0}] * 40) == []
+
+
+def test_rewards_larger_than_the_model_can_predict_are_told_once():
+    clipped = {"world_model/rewards_beyond_bins": 0.01}
+    ((step, warning),) = told([{}, {"world_model/rewards_beyond_bins": 0.0}, clipped, clipped])
+    assert step == 1_000
+    assert "exceed 147" in warning and "--training.reward-scale" in warning

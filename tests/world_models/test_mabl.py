@@ -744,5 +744,5 @@ def test_continuous_actions_are_regressed():
 
 def test_huber_is_quadratic_within_one_and_linear_beyond():
     reward, zeros = jnp.array([0.5, -1.0, 3.0]), jnp.zeros(3)
-    assert_allclose(reward_loss(zeros, reward, "huber"), [0.125, 0.5, 2.5])
-    assert_allclose(reward_loss(zeros, reward, "mse"), [0.125, 0.5, 4.5])
+    assert_allclose(reward_loss(zeros, None, reward, "huber"), [0.125, 0.5, 2.5])
+    assert_allclose(reward_loss(zeros, None, reward, "mse"), [0.125, 0.5, 4.5])

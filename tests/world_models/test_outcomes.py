@@ -6,10 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from tests.world_models.test_mabl import CONFIG, SPEC, some_rows
 
+from mabl.losses.two_hot import N_BINS, two_hot_mean
 from mabl.world_models.dreamer_v2 import DreamerV2
 from mabl.world_models.heads import Predictions
 from mabl.world_models.levels import Level, arriving
@@ -182,3 +184,53 @@ def test_with_posterior_conditioning_decoders_still_see_what_imagination_draws(m
     jax.tree.map(assert_array_equal, drawn, same)
     assert_array_equal(logits["global"], conditioned["global"])
     assert not np.allclose(logits["agent"], conditioned["agent"])
+
+
+@pytest.mark.parametrize("make", [MABL, MABLSG, DreamerV2, mamba])
+@pytest.mark.parametrize("reward_input", ["agent", "both"])
+def test_two_hot_rewards_are_the_mean_over_their_bins_and_are_learned(make, reward_input):
+    config = replace(
+        CONFIG,
+        reward_loss="two_hot",
+        outcomes="transition",
+        reward_input=reward_input,
+        overshooting=1.0,
+    )
+    model = make(SPEC, config, jax.random.key(0))
+    # Each agent is paid 10 after its action 1, and nothing after others.
+    rows = some_rows(12)
+    paid = (rows.prev_action == 1) & ~rows.is_first[:, None]
+    rows = rows._replace(reward=10.0 * paid)
+    batch = jax.tree.map(lambda x: x[None], rows)
+
+    @eqx.filter_jit
+    def predicted(model):
+        latents, _ = observe_sequence(model, rows, jax.random.key(1))
+        one = jax.tree.map(lambda x: x[:, None], latents)
+        return jax.tree.map(lambda x: x[:, 0], predict_sequence(model, one, config))
+
+    before = predicted(model)
+    assert before.reward_logits.shape == (12, 3, N_BINS)
+    assert_allclose(before.reward, two_hot_mean(before.reward_logits), rtol=1e-4, atol=1e-5)
+    has_two = reward_input == "both" and make in (MABL, MABLSG)
+    assert (before.agent_reward_logits is not None) == has_two
+
+    optimiser = optax.adam(1e-2)
+    state = optimiser.init(eqx.filter(model, eqx.is_array))
+
+    @eqx.filter_jit
+    def learn(model, state, key):
+        gradient, metrics = eqx.filter_grad(model_loss, has_aux=True)(
+            model, batch, key, config, SPEC.action_space
+        )
+        step, state = optimiser.update(gradient, state)
+        return eqx.apply_updates(model, step), state, metrics
+
+    for i in range(200):
+        model, state, metrics = learn(model, state, jax.random.key(i))
+    after = predicted(model)
+    follows = (~rows.is_first & (jnp.arange(12) > 0))[:, None]
+    assert (paid & follows).any() and (~paid & follows).any()
+    assert_allclose(after.reward[paid & follows], 10.0, atol=2.0)
+    assert_allclose(after.reward[~paid & follows], 0.0, atol=1.0)
+    assert metrics["world_model/rewards_beyond_bins"] == 0

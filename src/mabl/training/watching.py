@@ -2,6 +2,7 @@
 
 import math
 
+from mabl.losses.two_hot import MOST
 from mabl.runs.metrics import Row
 
 SETTLED_KL, SETTLED_ENTROPY = 1e-3, 0.05
@@ -15,11 +16,13 @@ IDLE_STEPS = 10_000
 
 
 class Watch:
-    """Warn, once for each reason, when a policy or the global latent has stopped working."""
+    """Warn, once for each reason, when a policy or the global latent has stopped working, or when
+    rewards are larger than the model can predict."""
 
     def __init__(self, total_steps: int):
         self._settled = _Since(SETTLED_SHARE * total_steps)
         self._idle = _Since(IDLE_STEPS)
+        self._clipped = False
 
     def warnings(self, step: int, row: Row) -> list[str]:
         """Warnings that a cycle's metrics give rise to; `step` is the run's at its end."""
@@ -34,6 +37,13 @@ class Watch:
                     f"updates have had a KL below {SETTLED_KL:g} and its entropy was below "
                     f"{SETTLED_ENTROPY:.0%} of the largest; try a larger entropy bonus"
                 )
+        if row.get("world_model/rewards_beyond_bins", 0.0) > 0 and not self._clipped:
+            self._clipped = True
+            found.append(
+                f"rewards at step {step:,} are larger than the world model can predict: scaled, "
+                f"they exceed {MOST:.0f}; give a smaller --training.reward-scale, or "
+                "--world-model.reward-loss mse"
+            )
         nats = row.get("world_model/kl_global", math.nan)
         if math.isfinite(nats) and self._idle.long_enough(step, nats < IDLE_NATS):
             found.append(

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal, Protocol, TypeVar
 from jaxtyping import Array, Bool, Float
 
 from mabl.errors import UserError, require_between, require_positive
+from mabl.losses.two_hot import N_BINS
 from mabl.nets.categorical import CodeShape
 from mabl.nets.mlp import Activation, Features
 from mabl.rows import TimeStep
@@ -70,8 +71,10 @@ class WorldModelConfig:
     reward_input: Literal["agent", "both"] = "agent"
     """What imagination's reward predictor sees: (z_agent, h_agent) as in the paper, or both levels,
     where there are two; then the agent's own predictor is trained beside it."""
-    reward_loss: Literal["huber", "mse"] = "huber"
-    """Likelihood of the reward: smooth L1 with delta 1, or half the squared error."""
+    reward_loss: Literal["huber", "mse", "two_hot"] = "huber"
+    """Likelihood of the reward: smooth L1 with delta 1, half the squared error, or a categorical
+    over bins as in DreamerV3, which learns rare large rewards sooner (ADR 27). The bins reach to
+    147 either way, in rewards as scaled by `training.reward_scale`."""
     reward_weight: float = 1.0
     """Weight of the reward's loss: what pays is a small part of what is seen."""
     end_weight: float = 1.0
@@ -111,6 +114,11 @@ class WorldModelConfig:
     def latent(self) -> CodeShape:
         """Of a latent state."""
         return CodeShape(self.n_categoricals, self.n_classes)
+
+    @property
+    def reward_bins(self) -> int:
+        """Numbers that predict a reward: one, or the logits of its bins."""
+        return N_BINS if self.reward_loss == "two_hot" else 1
 
     @property
     def filter_decodes(self) -> bool:

@@ -110,6 +110,7 @@ class BiLevel(eqx.Module):
             n_hidden=config.n_hidden,
             both_levels_reward=config.reward_input == "both",
             wins=spec.scores_wins,
+            reward_bins=config.reward_bins,
             key=keys[6],
             activation=activation,
         )

@@ -58,6 +58,7 @@ class DreamerV2(eqx.Module):
             n_hidden=config.n_hidden,
             both_levels_reward=False,
             wins=spec.scores_wins,
+            reward_bins=config.reward_bins,
             key=keys[2],
             activation=config.activation,
         )

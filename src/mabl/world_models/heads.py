@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mabl.losses.two_hot import two_hot_mean
 from mabl.nets.categorical import still
 from mabl.nets.mlp import (
     MLP,
@@ -37,10 +38,28 @@ class Predictions(NamedTuple):
     """Logit of p(alive)."""
     action: Float[Array, "*b A"]
     """The agent's own previous action: logits if discrete, mean if continuous."""
+    reward_logits: Float[Array, "*b K"] | None = None
+    """Of the reward's bins (`reward_loss=two_hot`), whose mean `reward` is."""
+    agent_reward_logits: Float[Array, "*b K"] | None = None
+    """The same of `agent_reward`."""
     win: Float[Array, "*b"] | None = None
     """Logit of p(win | the episode ends here), where scores tell wins."""
     state: Float[Array, "*b S"] | None = None
     """The environment's state, where global levels decode it."""
+
+
+class Scalar(NamedTuple):
+    """A predicted number, and the logits of its bins if it has any."""
+
+    mean: Float[Array, ""]
+    logits: Float[Array, " K"] | None
+
+
+def scalar_of(output: Float[Array, " K"]) -> Scalar:
+    """The number that a head's output stands for: itself, or the mean over its bins."""
+    if output.shape[-1] == 1:
+        return Scalar(output[0], None)
+    return Scalar(two_hot_mean(output), output)
 
 
 class Heads(eqx.Module):
@@ -75,10 +94,12 @@ class Heads(eqx.Module):
         key: PRNGKey,
         activation: Activation = "relu",
         wins: bool = False,
+        reward_bins: int = 1,
     ):
         """`agent` and `full` are the widths of what decoders see: its own level, and all levels.
 
-        Without `obs_dim` there is no decoder of observations.
+        Without `obs_dim` there is no decoder of observations. Rewards are predicted by
+        `reward_bins` logits each, or by one number.
         """
         keys = jax.random.split(key, 7)
 
@@ -92,11 +113,11 @@ class Heads(eqx.Module):
             )
             return first, [eqx.tree_at(lambda m: m.layers, m, m.layers[1:]) for m in whole]
 
-        sizes = (1,) if obs_dim is None else (obs_dim, 1)
+        sizes = (reward_bins,) if obs_dim is None else (obs_dim, reward_bins)
         self.agent_in, own = decoders(agent, sizes, keys[2 - len(sizes) : 2])
         self.obs = None if obs_dim is None else own[0]
         self.agent_reward = own[-1]
-        sizes = (1, action_dim + 1, action_dim) + (1,) * both_levels_reward
+        sizes = (1, action_dim + 1, action_dim) + (reward_bins,) * both_levels_reward
         self.full_in, rest = decoders(full, sizes, keys[2 : 2 + len(sizes)])
         self.terminated, self.available, self.action = rest[:3]
         self.full_reward = rest[3] if both_levels_reward else None
@@ -123,15 +144,19 @@ class Heads(eqx.Module):
             self.full_in, full, 4 if self.full_reward else 3
         )
         offered = self.available(available)
-        agent_reward = self.agent_reward(reward)[0]
+        own = scalar_of(self.agent_reward(reward))
+        both_levels = scalar_of(self.full_reward(both[0])) if self.full_reward else None
+        used = both_levels or own
         return Predictions(
             obs=obs,
-            reward=self.full_reward(both[0])[0] if self.full_reward else agent_reward,
-            agent_reward=agent_reward if self.full_reward else None,
+            reward=used.mean,
+            agent_reward=own.mean if both_levels else None,
             terminated=self.terminated(terminated)[0],
             available=offered[:-1],
             alive=offered[-1],
             action=self.action(action),
+            reward_logits=used.logits,
+            agent_reward_logits=own.logits if both_levels else None,
             win=None if self.win is None else self.win(*detached(full))[0],
         )
 

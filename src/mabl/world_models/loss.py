@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from mabl.envs.base import ActionSpace, Discrete
 from mabl.losses.kl import balanced_kl, categorical_kl
+from mabl.losses.two_hot import beyond_bins, two_hot_loss
 from mabl.nets.categorical import still
 from mabl.rows import TimeStep, is_last
 from mabl.types import Metrics, PRNGKey
@@ -70,6 +71,8 @@ def model_loss(
     total = jnp.stack(list(means.values())).sum()
     metrics = {f"world_model/loss_{name}": value for name, value in means.items()}
     metrics["world_model/loss"] = total
+    if config.reward_loss == "two_hot":
+        metrics["world_model/rewards_beyond_bins"] = beyond_bins(rows.reward)
     for level, posterior in observed.posterior.items():
         nats = categorical_kl(posterior, observed.prior[level]).sum(-1).mean()
         metrics[f"world_model/kl_{level}"] = nats
@@ -103,7 +106,7 @@ def absorbing_loss(
             after = model.imagine(latent, action, key_latent)
             said = predict_step(model, latent, after, config)
             loss = config.reward_weight * reward_loss(
-                said.reward, jnp.zeros_like(said.reward), config.reward_loss
+                said.reward, said.reward_logits, jnp.zeros_like(said.reward), config.reward_loss
             ) + config.end_weight * optax.sigmoid_binary_cross_entropy(
                 said.terminated, jnp.ones_like(said.terminated)
             )
@@ -162,7 +165,7 @@ def decoder_losses(
         "obs": config.obs_weight
         * (alive * optax.huber_loss(predicted.obs / std, rows.obs / std).sum(-1)),
         "reward": config.reward_weight
-        * reward_loss(predicted.reward, rows.reward, config.reward_loss),
+        * reward_loss(predicted.reward, predicted.reward_logits, rows.reward, config.reward_loss),
         "terminated": config.end_weight
         * optax.sigmoid_binary_cross_entropy(
             predicted.terminated, rows.terminated.astype(jnp.float32)
@@ -186,15 +189,24 @@ def decoder_losses(
     if predicted.agent_reward is not None:
         weight = config.agent_reward_weight * config.reward_weight
         losses["agent_reward"] = weight * reward_loss(
-            predicted.agent_reward, rows.reward, config.reward_loss
+            predicted.agent_reward,
+            predicted.agent_reward_logits,
+            rows.reward,
+            config.reward_loss,
         )
     return losses
 
 
 def reward_loss(
-    predicted: Float[Array, "*b"], reward: Float[Array, "*b"], kind: str
+    predicted: Float[Array, "*b"],
+    logits: Float[Array, "*b K"] | None,
+    reward: Float[Array, "*b"],
+    kind: str,
 ) -> Float[Array, "*b"]:
-    """-log p(r | ...) up to a constant: Huber (smooth L1) or Gaussian with unit variance."""
+    """-log p(r | ...) up to a constant: Huber (smooth L1), Gaussian with unit variance, or the
+    categorical over bins, if its `logits` predict the reward."""
+    if logits is not None:
+        return two_hot_loss(logits, reward)
     return {"huber": optax.huber_loss, "mse": optax.l2_loss}[kind](predicted, reward)
 
 

@@ -232,6 +232,7 @@ class DecoderNets(eqx.Module):
             n_hidden=config.n_hidden,
             both_levels_reward=False,
             wins=spec.scores_wins,
+            reward_bins=config.reward_bins,
             key=key_heads,
             activation=config.activation,
         )

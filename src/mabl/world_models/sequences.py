@@ -57,7 +57,14 @@ def observe_batch(model: WorldModel, rows: TimeStep, key: PRNGKey, train: bool =
     return Observed(latents, prior_latents, posterior, prior)
 
 
-OUTCOMES = ("reward", "agent_reward", "terminated", "win")
+OUTCOMES = (
+    "reward",
+    "agent_reward",
+    "terminated",
+    "win",
+    "reward_logits",
+    "agent_reward_logits",
+)
 """Predictions that `WorldModelConfig.outcomes` is about, and their losses."""
 
 
