@@ -1,7 +1,7 @@
 """Two-hot regression of a scalar by a categorical over bins, as in DreamerV3 (Hafner et al. 2023).
 
-The squared error of a rare large value, such as the reward of a win, is learned late: until then
-its row alone asks for a value far from all others. A categorical learns its probability (ADR 27).
+For targets that are small on most rows and large on a few, such as the reward of a win (ADR 27):
+the categorical learns the probability of the large value, where the squared error fits its size.
 """
 
 from math import expm1
@@ -12,13 +12,13 @@ from jaxtyping import Array, Float
 
 N_BINS = 51
 LIMIT = 5.0
-"""The outermost bins, in symlog units."""
+"""Distance of the outermost bins from 0, in symlog units."""
 MOST = expm1(LIMIT)
 """The largest value that can be predicted: 147.4."""
 
 
 def bins() -> Float[Array, " K"]:
-    """Values of the bins, equally spaced in symlog units: dense near 0, 22% apart far from it."""
+    """Values of the bins, equally spaced in symlog units: sign(x) log(1 + |x|)."""
     half = N_BINS // 2
     x = LIMIT * (jnp.arange(N_BINS) - half) / half
     return jnp.sign(x) * jnp.expm1(jnp.abs(x))
@@ -30,9 +30,9 @@ def two_hot_mean(logits: Float[Array, "*b K"]) -> Float[Array, "*b"]:
 
 
 def two_hot_loss(logits: Float[Array, "*b K"], target: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Cross-entropy against the two bins beside the target, weighted so that their mean is it.
+    """Cross-entropy against the two bins beside the target, whose weighted mean is the target.
 
-    Targets beyond the outermost bins count as those: see `beyond_bins`.
+    Targets beyond the outermost bins are clipped to them: see `beyond_bins`.
     """
     values = bins()
     target = jnp.clip(target, values[0], values[-1])

@@ -22,7 +22,7 @@ class Watch:
     def __init__(self, total_steps: int):
         self._settled = _Since(SETTLED_SHARE * total_steps)
         self._idle = _Since(IDLE_STEPS)
-        self._clipped = False
+        self._beyond = _Since(0)
 
     def warnings(self, step: int, row: Row) -> list[str]:
         """Warnings that a cycle's metrics give rise to; `step` is the run's at its end."""
@@ -37,11 +37,11 @@ class Watch:
                     f"updates have had a KL below {SETTLED_KL:g} and its entropy was below "
                     f"{SETTLED_ENTROPY:.0%} of the largest; try a larger entropy bonus"
                 )
-        if row.get("world_model/rewards_beyond_bins", 0.0) > 0 and not self._clipped:
-            self._clipped = True
+        beyond = row.get("world_model/rewards_beyond_bins", 0.0) > 0
+        if self._beyond.long_enough(step, beyond):
             found.append(
-                f"rewards at step {step:,} are larger than the world model can predict: scaled, "
-                f"they exceed {MOST:.0f}; give a smaller --training.reward-scale, or "
+                f"rewards at step {step:,} are larger than the world model can predict: multiplied "
+                f"by --training.reward-scale they exceed {MOST:.0f}; give a smaller scale, or "
                 "--world-model.reward-loss mse"
             )
         nats = row.get("world_model/kl_global", math.nan)

@@ -69,12 +69,12 @@ class WorldModelConfig:
     paper, or (z_{t-1}, h_t), which does not know the row's observation and is what imagination has,
     as in MAMBA's code."""
     reward_input: Literal["agent", "both"] = "agent"
-    """What imagination's reward predictor sees: (z_agent, h_agent) as in the paper, or both levels,
+    """Input of imagination's reward predictor: (z_agent, h_agent) as in the paper, or both levels,
     where there are two; then the agent's own predictor is trained beside it."""
     reward_loss: Literal["huber", "mse", "two_hot"] = "huber"
     """Likelihood of the reward: smooth L1 with delta 1, half the squared error, or a categorical
-    over bins as in DreamerV3, which learns rare large rewards sooner (ADR 27). The bins reach to
-    147 either way, in rewards as scaled by `training.reward_scale`."""
+    over bins as in DreamerV3 (ADR 27). The bins cover -147 to 147, in rewards multiplied by
+    `training.reward_scale`."""
     reward_weight: float = 1.0
     """Weight of the reward's loss: what pays is a small part of what is seen."""
     end_weight: float = 1.0
@@ -117,7 +117,7 @@ class WorldModelConfig:
 
     @property
     def reward_bins(self) -> int:
-        """Numbers that predict a reward: one, or the logits of its bins."""
+        """Outputs of a predictor of rewards: one number, or the logits of bins."""
         return N_BINS if self.reward_loss == "two_hot" else 1
 
     @property

@@ -39,9 +39,9 @@ class Predictions(NamedTuple):
     action: Float[Array, "*b A"]
     """The agent's own previous action: logits if discrete, mean if continuous."""
     reward_logits: Float[Array, "*b K"] | None = None
-    """Of the reward's bins (`reward_loss=two_hot`), whose mean `reward` is."""
+    """Logits of the bins whose mean is `reward`, with `reward_loss=two_hot`."""
     agent_reward_logits: Float[Array, "*b K"] | None = None
-    """The same of `agent_reward`."""
+    """Logits of the bins whose mean is `agent_reward`."""
     win: Float[Array, "*b"] | None = None
     """Logit of p(win | the episode ends here), where scores tell wins."""
     state: Float[Array, "*b S"] | None = None
@@ -56,7 +56,7 @@ class Scalar(NamedTuple):
 
 
 def scalar_of(output: Float[Array, " K"]) -> Scalar:
-    """The number that a head's output stands for: itself, or the mean over its bins."""
+    """Read a head's output: one number as it is, several as the logits of bins."""
     if output.shape[-1] == 1:
         return Scalar(output[0], None)
     return Scalar(two_hot_mean(output), output)
@@ -98,8 +98,8 @@ class Heads(eqx.Module):
     ):
         """`agent` and `full` are the widths of what decoders see: its own level, and all levels.
 
-        Without `obs_dim` there is no decoder of observations. Rewards are predicted by
-        `reward_bins` logits each, or by one number.
+        Without `obs_dim` there is no decoder of observations. Each predictor of rewards has
+        `reward_bins` outputs: 1, or the logits of that many bins.
         """
         keys = jax.random.split(key, 7)
 
